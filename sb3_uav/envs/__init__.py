@@ -1,0 +1,28 @@
+from sb3_uav.envs.allocation import AllocationProblem, TaskAllocationEnv, plan_tours, schedules, split_tasks
+from sb3_uav.envs.instances import ClusteredGenerator, FixedGenerator, InstanceGenerator, Instances, UniformGenerator
+from sb3_uav.envs.routing import RoutePlanningEnv, Router, RoutingProblem, collected_value, nearest_feasible
+from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, ScheduleReport, check_schedule
+from sb3_uav.envs.vec_env import BatchedVecEnv
+
+__all__ = [
+    "AllocationProblem",
+    "BatchedVecEnv",
+    "ClusteredGenerator",
+    "FixedGenerator",
+    "InfeasibleScheduleError",
+    "InstanceGenerator",
+    "Instances",
+    "RoutePlanningEnv",
+    "Router",
+    "RoutingProblem",
+    "Schedule",
+    "ScheduleReport",
+    "TaskAllocationEnv",
+    "UniformGenerator",
+    "check_schedule",
+    "collected_value",
+    "nearest_feasible",
+    "plan_tours",
+    "schedules",
+    "split_tasks",
+]

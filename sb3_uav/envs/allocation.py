@@ -1,0 +1,246 @@
+"""Task allocation (the paper's upper level): every task, one a step in input order, is given to a UAV."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_uav.envs.gym_env import ProblemEnv
+from sb3_uav.envs.instances import InstanceGenerator, Instances, make_generator
+from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
+from sb3_uav.envs.schedule import Schedule
+
+UNASSIGNED = -1
+
+
+class AllocationState(NamedTuple):
+    """
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` while it has none
+    :param task: ``(batch, n_samples)`` int64, index of the task to allocate next
+    :param done: ``(batch, n_samples)`` bool, True when every real task has a UAV
+    :param action_mask: ``(batch, n_samples, n_uavs)`` bool; any UAV may take any task
+    """
+
+    assignment: th.Tensor
+    task: th.Tensor
+    done: th.Tensor
+    action_mask: th.Tensor
+
+
+class AllocationDynamics(Dynamics):
+    """
+    Transitions of task allocation (paper, section IV-A1).
+
+    The one reward, at the end, is the value of the tasks that the router's tours visit.
+
+    :param instances: The instances
+    :param router: Plans the tours of the reward
+    """
+
+    def __init__(self, instances: Instances, router: Router) -> None:
+        super().__init__(instances)
+        self.router = router
+        self._n_real = instances.task_mask.sum(1)[:, None]
+
+    def reset(self, n_samples: int = 1) -> AllocationState:
+        batch_size, n_tasks = self.instances.task_mask.shape
+        device = self.instances.device
+        task = th.zeros(batch_size, n_samples, dtype=th.int64, device=device)
+        return AllocationState(
+            assignment=th.full((batch_size, n_samples, n_tasks), UNASSIGNED, dtype=th.int64, device=device),
+            task=task,
+            done=task >= self._n_real,
+            action_mask=th.ones(batch_size, n_samples, self.instances.n_uavs, dtype=th.bool, device=device),
+        )
+
+    def step(self, state: AllocationState, actions: th.Tensor) -> tuple[AllocationState, th.Tensor]:
+        active = ~state.done
+        slot = state.task.clamp(max=self.instances.n_tasks - 1)[..., None]
+        chosen = th.where(active, actions, state.assignment.gather(-1, slot).squeeze(-1))
+        assignment = state.assignment.scatter(-1, slot, chosen[..., None])
+        task = state.task + active
+        done = task >= self._n_real
+        finished = done & active
+        rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
+        rows = finished.any(1)
+        if rows.any():
+            value = plan_tours(self.instances[rows], assignment[rows], self.router).value
+            rewards[rows] = value.where(finished[rows], 0.0)
+        return AllocationState(assignment, task, done, state.action_mask), rewards
+
+
+class Subsets(NamedTuple):
+    """
+    :param instances: ``batch * n_samples * n_uavs`` single-UAV instances, one for every UAV of every allocation
+    :param task_index: ``(batch * n_samples * n_uavs, n_slots)`` int64, the task of the original instance in each slot
+    """
+
+    instances: Instances
+    task_index: th.Tensor
+
+
+def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
+    """
+    Cut instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
+
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64; tasks with ``UNASSIGNED`` and padded tasks are left out
+    :return: The subsets, ordered by (instance, sample, UAV), padded to the largest
+    """
+    batch_size, n_samples, n_tasks = assignment.shape
+    n_uavs = instances.n_uavs
+    left_out = (assignment == UNASSIGNED) | ~instances.task_mask[:, None]
+    key = assignment.masked_fill(left_out, n_uavs)
+    order = key.argsort(dim=-1, stable=True)
+    counts = th.zeros(batch_size, n_samples, n_uavs + 1, dtype=th.int64, device=key.device)
+    counts = counts.scatter_add(-1, key, th.ones_like(key))[..., :n_uavs]
+    n_slots = max(int(counts.max()), 1)
+    slots = th.arange(n_slots, device=key.device)
+    start = counts.cumsum(-1) - counts
+    position = (start[..., None] + slots).clamp(max=n_tasks - 1)
+    task_index = order.gather(-1, position.flatten(2)).view(batch_size, -1)
+    task_mask = (slots < counts[..., None]).view(-1, n_slots)
+
+    def per_uav(field: th.Tensor) -> th.Tensor:
+        return field.repeat_interleave(n_samples * n_uavs, dim=0)
+
+    subsets = replace(
+        instances,
+        depot=per_uav(instances.depot),
+        tasks=instances.tasks.gather(1, task_index[..., None].expand(-1, -1, 2)).view(-1, n_slots, 2),
+        values=instances.values.gather(1, task_index).view(-1, n_slots),
+        max_distance=per_uav(instances.max_distance),
+        n_uavs=1,
+        task_mask=task_mask,
+    )
+    return Subsets(subsets, task_index.view(-1, n_slots))
+
+
+class PlannedTours(NamedTuple):
+    """
+    :param tours: ``(batch, n_samples, n_uavs, n_steps)`` int64, tasks of the original instance, -1 as padding
+    :param value: ``(batch, n_samples)`` float64, total value of the visited tasks
+    """
+
+    tours: th.Tensor
+    value: th.Tensor
+
+
+def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> PlannedTours:
+    """
+    Let the router plan every UAV's tour over the tasks it was given.
+
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64
+    :param router: Plans one tour per row
+    :return: The tours and what they collect
+    """
+    shape = (*assignment.shape[:2], instances.n_uavs)
+    subsets = split_tasks(instances, assignment)
+    nodes = router(subsets.instances).to(assignment.device)
+    value = collected_value(subsets.instances, nodes).view(shape).sum(-1)
+    tours = subsets.task_index.gather(1, (nodes - 1).clamp(min=0)).masked_fill(nodes == DEPOT, -1)
+    return PlannedTours(tours.view(*shape, -1), value)
+
+
+def schedules(tours: th.Tensor) -> list[Schedule]:
+    """
+    :param tours: ``(batch, n_uavs, n_steps)`` int64, tasks from 0, -1 as padding
+    :return: One schedule per row
+    """
+    return [Schedule([[task for task in tour if task >= 0] for tour in row]) for row in tours.tolist()]
+
+
+class AllocationProblem(Problem):
+    """
+    Task allocation: one task is given to a UAV per step; the reward comes at the end.
+
+    :param generator: Draws the instances
+    :param router: Plans the tours of the reward; nearest feasible task when None
+    """
+
+    def __init__(self, generator: InstanceGenerator, router: Router | None = None) -> None:
+        super().__init__(generator)
+        self.router: Router = router or nearest_feasible
+
+    def _action_space(self) -> spaces.Discrete:
+        return spaces.Discrete(self.generator.n_uavs)
+
+    def _dynamic_spaces(self) -> dict[str, spaces.Space]:
+        n_tasks, n_uavs = self.generator.n_tasks, self.generator.n_uavs
+        return {
+            "assignment": spaces.Box(UNASSIGNED, n_uavs - 1, (n_tasks,), np.float32),
+            "current_task": spaces.Box(0, n_tasks, (1,), np.float32),
+            "action_mask": spaces.MultiBinary(n_uavs),
+        }
+
+    def dynamics(self, instances: Instances) -> AllocationDynamics:
+        # Looked up at every step, so that a router set during an episode is used.
+        return AllocationDynamics(instances, lambda subsets: self.router(subsets))
+
+    def observe(self, dynamics: AllocationDynamics, state: AllocationState) -> dict[str, th.Tensor]:
+        return {
+            "assignment": state.assignment[:, 0],
+            "current_task": state.task,
+            "action_mask": state.action_mask[:, 0],
+        }
+
+    def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
+        return plan_tours(instances, actions, self.router).value
+
+    def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
+        rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
+        last = (self.lengths(instances, actions) - 1).clamp(min=0)
+        return rewards.scatter(-1, last[..., None], returns[..., None])
+
+    def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
+        return instances.task_mask.sum(1)[:, None].expand(actions.shape[:2])
+
+    def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
+        # Until the end there are no tours: draw the tasks of each UAV in the order in which it got them.
+        if len(actions) < int(instance.task_mask.sum()):
+            return [[task for task, uav in enumerate(actions) if uav == v] for v in range(instance.n_uavs)]
+        assignment = th.full((1, 1, instance.n_tasks), UNASSIGNED)
+        assignment[0, 0, : len(actions)] = th.tensor(actions)
+        planned = plan_tours(instance, assignment, self.router)
+        return [list(route) for route in schedules(planned.tours[:, 0])[0].routes]
+
+
+class TaskAllocationEnv(ProblemEnv):
+    """
+    Task allocation as a Gymnasium environment (``TaskAllocation-U{V}-N{N}-v0``).
+
+    :param n_tasks: Number of tasks
+    :param n_uavs: Number of UAVs
+    :param max_distance: Maximum flight distance
+    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
+    :param generator: Any other source of instances
+    :param router: Plans the tours of the reward; nearest feasible task when None
+    :param render_mode: ``"human"``, ``"rgb_array"`` or None
+    """
+
+    problem: AllocationProblem
+
+    def __init__(
+        self,
+        n_tasks: int = 20,
+        n_uavs: int = 4,
+        max_distance: float = 2.0,
+        distribution: str = "uniform",
+        instances: Any = None,
+        generator: InstanceGenerator | None = None,
+        router: Router | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        generator = generator or make_generator(n_tasks, n_uavs, max_distance, distribution, instances)
+        super().__init__(AllocationProblem(generator, router), render_mode)
+
+    def set_router(self, router: Router) -> None:
+        """Use another router from the next reward on."""
+        self.problem.router = router

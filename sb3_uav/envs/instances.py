@@ -1,0 +1,451 @@
+"""Problem instances: batches of tensors, generators that draw them, and their ``.npz`` files."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+
+# One tolerance for the dynamics and for the checker, relative to the maximum flight distance.
+DISTANCE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """
+    A batch of problem instances: one depot, ``n_tasks`` tasks and ``n_uavs`` identical UAVs each.
+
+    Coordinates are float64, so that feasibility is decided at that precision; networks work on ``float()`` copies.
+    Rows with fewer tasks are padded at the end, and ``task_mask`` says which tasks are real. The constructor checks shapes
+    only, because the hot loops build subsets by the thousand; :meth:`validate` checks the contents, and
+    :meth:`from_arrays` and :meth:`load` call it.
+
+    :param depot: ``(batch, 2)``
+    :param tasks: ``(batch, n_tasks, 2)``
+    :param values: ``(batch, n_tasks)``, the prize of each task
+    :param max_distance: ``(batch,)``, the longest tour a UAV can fly (the paper's D), in the unit of the coordinates
+    :param n_uavs: Number of UAVs (the paper's V), the same for all rows
+    :param task_mask: ``(batch, n_tasks)`` bool, False where a row is padded
+    """
+
+    depot: th.Tensor
+    tasks: th.Tensor
+    values: th.Tensor
+    max_distance: th.Tensor
+    n_uavs: int
+    task_mask: th.Tensor
+
+    def __post_init__(self) -> None:
+        batch_size, n_tasks = self.tasks.shape[:2]
+        for name, shape in (
+            ("depot", (batch_size, 2)),
+            ("tasks", (batch_size, n_tasks, 2)),
+            ("values", (batch_size, n_tasks)),
+            ("max_distance", (batch_size,)),
+            ("task_mask", (batch_size, n_tasks)),
+        ):
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"Instances.{name} has shape {found}, expected {shape} to match tasks; check the array.")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        depot: Any,
+        tasks: Any,
+        values: Any = None,
+        max_distance: Any = 2.0,
+        n_uavs: Any = 4,
+        task_mask: Any = None,
+        source: str = "Instances",
+    ) -> Instances:
+        """
+        Build and validate instances from anything numpy understands.
+
+        :param depot: ``(batch, 2)``, or ``(2,)`` for one instance
+        :param tasks: ``(batch, n_tasks, 2)``, or ``(n_tasks, 2)`` for one instance
+        :param values: ``(batch, n_tasks)``; all 1 when None
+        :param max_distance: ``(batch,)`` or a number
+        :param n_uavs: ``(batch,)``, all the same, or a number
+        :param task_mask: ``(batch, n_tasks)`` bool; all True when None
+        :param source: What the arrays were read from, named in errors
+        :return: The instances, float64 on the CPU
+        :raises ValueError: If a shape or a value is not allowed; the message names the field and what was found
+        """
+        try:
+            tasks = np.array(tasks, dtype=np.float64)
+            depot = np.array(depot, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{source}: depot and tasks must be arrays of numbers: {error}") from error
+        if tasks.ndim == 2 and depot.ndim == 1:
+            tasks, depot = tasks[None], depot[None]
+            values = None if values is None else np.asarray(values)[None]
+            task_mask = None if task_mask is None else np.asarray(task_mask)[None]
+        if tasks.ndim != 3 or tasks.shape[-1] != 2:
+            raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}, expected (batch, n_tasks, 2).")
+        batch_size, n_tasks = tasks.shape[:2]
+        if batch_size < 1 or n_tasks < 1:
+            raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}; give at least one instance with one task.")
+        uavs = np.unique(np.asarray(n_uavs))
+        if len(uavs) != 1:
+            raise ValueError(f"{source}: field 'n_uavs' mixes {uavs.tolist()}; store each fleet size in a file of its own.")
+        if not float(uavs[0]).is_integer() or uavs[0] < 1:
+            raise ValueError(f"{source}: field 'n_uavs' is {uavs[0]}, but a fleet has a whole number of UAVs, at least 1.")
+        try:
+            distance = np.broadcast_to(np.asarray(max_distance, dtype=np.float64), (batch_size,))
+        except ValueError as error:
+            found = np.shape(max_distance)
+            raise ValueError(f"{source}: field 'max_distance' has shape {found}, expected ({batch_size},).") from error
+        try:
+            instances = cls(
+                depot=th.from_numpy(depot),
+                tasks=th.from_numpy(tasks),
+                values=th.ones(batch_size, n_tasks, dtype=th.float64)
+                if values is None
+                else th.from_numpy(np.array(values, dtype=np.float64)),
+                max_distance=th.from_numpy(distance.copy()),
+                n_uavs=int(uavs[0]),
+                task_mask=th.ones(batch_size, n_tasks, dtype=th.bool)
+                if task_mask is None
+                else th.from_numpy(np.array(task_mask, dtype=bool)),
+            )
+            instances.validate()
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
+        return instances
+
+    def validate(self) -> None:
+        """
+        Check the contents.
+
+        :raises ValueError: On NaN or infinite numbers, a negative value, ``max_distance <= 0``, fewer than one UAV, or padding
+            that is not at the end of its row; the message names the field, the row and the value found
+        """
+        for name in ("depot", "tasks", "values", "max_distance"):
+            field = getattr(self, name)
+            bad = ~th.isfinite(field)
+            if bad.any():
+                where = tuple(int(i) for i in bad.nonzero()[0])
+                raise ValueError(f"field '{name}' holds {field[where].item()} at index {where}; every number must be finite.")
+        if self.n_uavs < 1:
+            raise ValueError(f"field 'n_uavs' is {self.n_uavs}, but a fleet needs at least 1 UAV.")
+        if (self.max_distance <= 0).any():
+            row = int((self.max_distance <= 0).nonzero()[0, 0])
+            found = self.max_distance[row].item()
+            raise ValueError(f"field 'max_distance' is {found} in instance {row}; the maximum flight distance must be > 0.")
+        if (self.values < 0).any():
+            where = tuple(int(i) for i in (self.values < 0).nonzero()[0])
+            raise ValueError(f"field 'values' holds {self.values[where].item()} at index {where}; task values must be >= 0.")
+        if (self.task_mask[:, 1:] & ~self.task_mask[:, :-1]).any():
+            raise ValueError("field 'task_mask' marks a real task after a padded one; put the padding at the end of each row.")
+
+    @property
+    def batch_size(self) -> int:
+        return self.tasks.shape[0]
+
+    @property
+    def n_tasks(self) -> int:
+        """Number of task slots of a row, padding included."""
+        return self.tasks.shape[1]
+
+    @property
+    def device(self) -> th.device:
+        return self.tasks.device
+
+    def __len__(self) -> int:
+        return self.batch_size
+
+    def __getitem__(self, rows: int | slice | th.Tensor | np.ndarray | Sequence[int]) -> Instances:
+        """Select rows; an ``int`` gives a batch of one."""
+        if isinstance(rows, int):
+            rows = slice(rows, rows + 1) if rows != -1 else slice(rows, None)
+        index: Any = th.as_tensor(rows, device=self.device) if not isinstance(rows, slice | th.Tensor) else rows
+        return replace(
+            self,
+            depot=self.depot[index],
+            tasks=self.tasks[index],
+            values=self.values[index],
+            max_distance=self.max_distance[index],
+            task_mask=self.task_mask[index],
+        )
+
+    def to(self, device: th.device | str) -> Instances:
+        """Copy to ``device``; returns ``self`` when it is there already."""
+        if self.device == th.device(device):
+            return self
+        return replace(
+            self,
+            depot=self.depot.to(device),
+            tasks=self.tasks.to(device),
+            values=self.values.to(device),
+            max_distance=self.max_distance.to(device),
+            task_mask=self.task_mask.to(device),
+        )
+
+    def trim(self, n_tasks: int) -> Instances:
+        """Keep the first ``n_tasks`` task slots of every row."""
+        return replace(
+            self,
+            tasks=self.tasks[:, :n_tasks],
+            values=self.values[:, :n_tasks],
+            task_mask=self.task_mask[:, :n_tasks],
+        )
+
+    def pad(self, n_tasks: int) -> Instances:
+        """Append padded task slots (at the depot, value 0) up to ``n_tasks``."""
+        missing = n_tasks - self.n_tasks
+        if missing <= 0:
+            return self
+        return replace(
+            self,
+            tasks=th.cat([self.tasks, self.depot[:, None].expand(-1, missing, -1)], dim=1),
+            values=th.cat([self.values, self.values.new_zeros(self.batch_size, missing)], dim=1),
+            task_mask=th.cat([self.task_mask, self.task_mask.new_zeros(self.batch_size, missing)], dim=1),
+        )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Instances]) -> Instances:
+        """
+        Join batches along the batch dimension, padding to the largest.
+
+        :raises ValueError: If the parts have different numbers of UAVs
+        """
+        fleets = {part.n_uavs for part in parts}
+        if len(fleets) != 1:
+            raise ValueError(f"Cannot join instances with different n_uavs: {sorted(fleets)}.")
+        n_tasks = max(part.n_tasks for part in parts)
+        padded = [part.pad(n_tasks) for part in parts]
+        return Instances(
+            depot=th.cat([part.depot for part in padded]),
+            tasks=th.cat([part.tasks for part in padded]),
+            values=th.cat([part.values for part in padded]),
+            max_distance=th.cat([part.max_distance for part in padded]),
+            n_uavs=fleets.pop(),
+            task_mask=th.cat([part.task_mask for part in padded]),
+        )
+
+    def home_distance(self) -> th.Tensor:
+        """Distance of every task to its depot, ``(batch, n_tasks)`` float64."""
+        return euclidean(self.tasks, self.depot[:, None])
+
+    def reachable(self) -> th.Tensor:
+        """Whether a UAV could fly to the task and back, ``(batch, n_tasks)`` bool; padded tasks are not."""
+        return self.task_mask & (2 * self.home_distance() <= distance_limit(self.max_distance)[:, None])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """
+        Write an ``.npz`` file (float64, no pickles) under a temporary name and rename it.
+
+        :param path: The file to write; ``.npz`` is appended when missing
+        """
+        path = Path(path)
+        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+        temporary = path.with_name(path.name + ".tmp.npz")
+        arrays = {name: getattr(self, name).cpu().numpy() for name in ("depot", "tasks", "values", "max_distance")}
+        arrays["n_uavs"] = np.full(self.batch_size, self.n_uavs)
+        if not self.task_mask.all():
+            arrays["task_mask"] = self.task_mask.cpu().numpy()
+        try:
+            np.savez_compressed(temporary, **arrays)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Instances:
+        """
+        Read an ``.npz`` file with arrays ``depot``, ``tasks``, and optionally ``values``, ``max_distance``, ``n_uavs`` and
+        ``task_mask``.
+
+        :param path: The file
+        :return: The validated instances
+        :raises FileNotFoundError: If there is no such file
+        :raises ValueError: If the file is not an intact ``.npz``, misses an array, or holds bad numbers
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+        except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); write it again.") from error
+        missing = {"depot", "tasks", "max_distance", "n_uavs"} - set(arrays)
+        if missing:
+            raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")
+        known = {"depot", "tasks", "values", "max_distance", "n_uavs", "task_mask"}
+        return cls.from_arrays(**{name: arrays[name] for name in known if name in arrays}, source=str(path))
+
+
+def euclidean(a: th.Tensor, b: th.Tensor) -> th.Tensor:
+    """
+    Euclidean distance over the last dimension.
+
+    Written out, so that every driver and batch size rounds alike.
+
+    :param a: ``(..., 2)``
+    :param b: ``(..., 2)``, broadcast against ``a``
+    :return: ``(...)``
+    """
+    dx, dy = (a - b).unbind(-1)
+    return th.sqrt(dx * dx + dy * dy)
+
+
+def distance_limit(max_distance: th.Tensor) -> th.Tensor:
+    """
+    The longest tour that counts as feasible: ``max_distance`` plus the rounding tolerance.
+
+    :param max_distance: ``(batch,)``
+    :return: ``(batch,)``
+    """
+    return max_distance + DISTANCE_TOLERANCE * max_distance.clamp(min=1.0)
+
+
+class InstanceGenerator(Protocol):
+    """Draws instances of one size. Stateless: the same ``rng`` state gives the same instances."""
+
+    n_tasks: int
+    n_uavs: int
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        :param batch_size: Number of instances
+        :param rng: The source of randomness
+        :return: ``batch_size`` instances of ``n_tasks`` task slots, float64 on the CPU
+        """
+        ...
+
+
+def check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
+    """
+    :raises ValueError: If a size is not allowed; the message names it
+    """
+    if n_tasks < 1:
+        raise ValueError(f"n_tasks is {n_tasks}, but an instance needs at least 1 task.")
+    if n_uavs < 1:
+        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV.")
+    if not (np.isfinite(max_distance) and max_distance > 0):
+        raise ValueError(f"max_distance is {max_distance}, but the maximum flight distance must be a finite number > 0.")
+
+
+def _with_unit_values(depot: np.ndarray, tasks: np.ndarray, max_distance: float, n_uavs: int) -> Instances:
+    batch_size, n_tasks = tasks.shape[:2]
+    return Instances(
+        depot=th.from_numpy(depot),
+        tasks=th.from_numpy(tasks),
+        values=th.ones(batch_size, n_tasks, dtype=th.float64),
+        max_distance=th.full((batch_size,), max_distance, dtype=th.float64),
+        n_uavs=n_uavs,
+        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool),
+    )
+
+
+@dataclass(frozen=True)
+class UniformGenerator:
+    """
+    Depot and tasks uniform in the unit square, all values 1: the paper's distribution (section V-A).
+
+    :param n_tasks: Number of tasks (the paper's N)
+    :param n_uavs: Number of UAVs (the paper's V)
+    :param max_distance: Maximum flight distance (the paper's D = 2.0)
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 4
+    max_distance: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        points = rng.random((batch_size, self.n_tasks + 1, 2))
+        return _with_unit_values(points[:, 0].copy(), points[:, 1:].copy(), self.max_distance, self.n_uavs)
+
+
+@dataclass(frozen=True)
+class ClusteredGenerator:
+    """
+    Tasks normally distributed around uniform centres, clipped to the unit square; the depot is uniform.
+
+    :param n_tasks: Number of tasks
+    :param n_uavs: Number of UAVs
+    :param max_distance: Maximum flight distance
+    :param n_clusters: Number of centres
+    :param spread: Standard deviation around a centre
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 4
+    max_distance: float = 2.0
+    n_clusters: int = 5
+    spread: float = 0.07
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        if self.n_clusters < 1 or not self.spread >= 0:
+            raise ValueError(f"n_clusters must be >= 1 and spread >= 0, found {self.n_clusters} and {self.spread}.")
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        depot = rng.random((batch_size, 2))
+        centres = rng.random((batch_size, self.n_clusters, 2))
+        cluster = rng.integers(self.n_clusters, size=(batch_size, self.n_tasks))
+        noise = rng.normal(0.0, self.spread, (batch_size, self.n_tasks, 2))
+        tasks = np.clip(np.take_along_axis(centres, cluster[..., None], axis=1) + noise, 0.0, 1.0)
+        return _with_unit_values(depot, tasks, self.max_distance, self.n_uavs)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedGenerator:
+    """
+    Rows of given instances, drawn at random with replacement.
+
+    :param instances: The instances to draw from
+    """
+
+    instances: Instances
+
+    @property
+    def n_tasks(self) -> int:  # type: ignore[override]
+        return self.instances.n_tasks
+
+    @property
+    def n_uavs(self) -> int:  # type: ignore[override]
+        return self.instances.n_uavs
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return self.instances[rng.integers(len(self.instances), size=batch_size)]
+
+
+GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator}
+
+
+def make_generator(
+    n_tasks: int,
+    n_uavs: int,
+    max_distance: float = 2.0,
+    distribution: str = "uniform",
+    instances: str | os.PathLike[str] | Instances | None = None,
+) -> InstanceGenerator:
+    """
+    The generator that plain-data arguments of an environment describe.
+
+    :param n_tasks: Number of tasks; ignored when ``instances`` is given
+    :param n_uavs: Number of UAVs; ignored when ``instances`` is given
+    :param max_distance: Maximum flight distance; ignored when ``instances`` is given
+    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param instances: Instances, or the path of an ``.npz`` file, to draw from instead of a distribution
+    :raises ValueError: If an argument is not allowed
+    """
+    if instances is not None:
+        return FixedGenerator(instances if isinstance(instances, Instances) else Instances.load(instances))
+    if distribution not in GENERATORS:
+        raise ValueError(f"distribution is {distribution!r}; choose one of {sorted(GENERATORS)}.")
+    return GENERATORS[distribution](n_tasks=n_tasks, n_uavs=n_uavs, max_distance=max_distance)

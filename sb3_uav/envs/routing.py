@@ -1,0 +1,181 @@
+"""Route planning (the paper's lower level): one UAV visits tasks until none fits into its remaining flight distance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_uav.envs.gym_env import ProblemEnv
+from sb3_uav.envs.instances import InstanceGenerator, Instances, distance_limit, euclidean, make_generator
+from sb3_uav.envs.problem import Dynamics, Problem
+
+DEPOT = 0
+
+# Plans one tour per row: Instances -> (batch, n_steps) int64 node indices, task j being node j + 1; DEPOT at the end and as
+# padding.
+Router = Callable[[Instances], th.Tensor]
+
+
+class RoutingState(NamedTuple):
+    """
+    :param position: ``(batch, n_samples)`` int64, the node where the UAV is: 0 the depot, j + 1 task j
+    :param visited: ``(batch, n_samples, n_tasks)`` bool
+    :param travelled: ``(batch, n_samples)`` float64, distance flown so far
+    :param done: ``(batch, n_samples)`` bool, True after the return to the depot
+    :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
+    """
+
+    position: th.Tensor
+    visited: th.Tensor
+    travelled: th.Tensor
+    done: th.Tensor
+    action_mask: th.Tensor
+
+
+class RoutingDynamics(Dynamics):
+    """
+    Transitions of route planning (paper, section IV-B; DESIGN, section 5).
+
+    A task is legal while it is unvisited and the UAV could fly to it and from there home: travelled + d(here, task) +
+    d(task, depot) <= D. The depot is legal only when no task is, because an early return can never help. An illegal action
+    flies the UAV home and so ends the episode.
+
+    :param instances: The instances; each row is one UAV's tasks, ``n_uavs`` is not used
+    """
+
+    def __init__(self, instances: Instances) -> None:
+        super().__init__(instances)
+        self.nodes = th.cat([instances.depot[:, None], instances.tasks], dim=1)
+        self.home = euclidean(self.nodes, instances.depot[:, None])
+        self.limit = distance_limit(instances.max_distance)
+        self._rows = th.arange(len(instances), device=instances.device)[:, None]
+
+    def reset(self, n_samples: int = 1) -> RoutingState:
+        shape = (len(self.instances), n_samples)
+        device = self.instances.device
+        position = th.zeros(shape, dtype=th.int64, device=device)
+        visited = ~self.instances.task_mask[:, None].expand(-1, n_samples, -1)
+        travelled = th.zeros(shape, dtype=th.float64, device=device)
+        done = th.zeros(shape, dtype=th.bool, device=device)
+        return RoutingState(position, visited, travelled, done, self._action_mask(position, visited, travelled, done))
+
+    def _action_mask(self, position: th.Tensor, visited: th.Tensor, travelled: th.Tensor, done: th.Tensor) -> th.Tensor:
+        here = self.nodes[self._rows, position]
+        detour = euclidean(self.nodes[:, None, 1:], here[:, :, None]) + self.home[:, None, 1:]
+        feasible = ~visited & (travelled[..., None] + detour <= self.limit[:, None, None]) & ~done[..., None]
+        return th.cat([~feasible.any(-1, keepdim=True), feasible], dim=-1)
+
+    def step(self, state: RoutingState, actions: th.Tensor) -> tuple[RoutingState, th.Tensor]:
+        legal = state.action_mask.gather(-1, actions[..., None]).squeeze(-1)
+        node = th.where(legal, actions, DEPOT)
+        goes_home = (node == DEPOT) & ~state.done
+        here, there = self.nodes[self._rows, state.position], self.nodes[self._rows, node]
+        # A finished UAV stands in the depot and goes nowhere: its leg has length 0.
+        travelled = state.travelled + euclidean(there, here)
+        # A padded first column takes the visits of the depot.
+        visited = th.cat([th.zeros_like(state.visited[..., :1]), state.visited], dim=-1)
+        visited = visited.scatter(-1, node[..., None], True)[..., 1:]
+        done = state.done | goes_home
+        prizes = th.cat([th.zeros_like(self.instances.values[:, :1]), self.instances.values], dim=1)
+        rewards = prizes.gather(1, node)
+        return RoutingState(node, visited, travelled, done, self._action_mask(node, visited, travelled, done)), rewards
+
+
+def nearest_feasible(instances: Instances) -> th.Tensor:
+    """
+    Always fly to the nearest task that still fits: the router of an allocation env that was given none.
+
+    :param instances: ``batch`` instances, one tour each
+    :return: ``(batch, n_steps)`` int64 node indices, padded with the depot
+    """
+    dynamics = RoutingDynamics(instances)
+    state = dynamics.reset()
+    tours = []
+    while not state.done.all():
+        here = dynamics.nodes[dynamics._rows, state.position]
+        distance = euclidean(dynamics.nodes[:, None], here[:, :, None])
+        action = distance.masked_fill(~state.action_mask, th.inf).argmin(-1)
+        tours.append(action)
+        state, _ = dynamics.step(state, action)
+    return th.cat(tours, dim=1)
+
+
+def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
+    """
+    Total value of the tasks of each tour.
+
+    :param instances: ``batch`` instances
+    :param tours: ``(batch, ..., n_steps)`` int64 node indices without repeated tasks, padded with the depot
+    :return: ``(batch, ...)`` float64
+    """
+    prizes = th.cat([th.zeros_like(instances.values[:, :1]), instances.values], dim=1)
+    return prizes.gather(1, tours.flatten(1)).view(tours.shape).sum(-1)
+
+
+class RoutingProblem(Problem):
+    """Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited."""
+
+    def _action_space(self) -> spaces.Discrete:
+        return spaces.Discrete(self.generator.n_tasks + 1)
+
+    def _dynamic_spaces(self) -> dict[str, spaces.Space]:
+        n_tasks = self.generator.n_tasks
+        return {
+            "position": spaces.Box(0, n_tasks, (1,), np.float32),
+            "remaining_distance": spaces.Box(-np.inf, np.inf, (1,), np.float32),
+            "visited": spaces.MultiBinary(n_tasks),
+            "action_mask": spaces.MultiBinary(n_tasks + 1),
+        }
+
+    def dynamics(self, instances: Instances) -> RoutingDynamics:
+        return RoutingDynamics(instances)
+
+    def observe(self, dynamics: RoutingDynamics, state: RoutingState) -> dict[str, th.Tensor]:
+        remaining = dynamics.instances.max_distance[:, None] - state.travelled
+        return {
+            "position": state.position,
+            "remaining_distance": remaining,
+            "visited": state.visited[:, 0] & dynamics.instances.task_mask,
+            "action_mask": state.action_mask[:, 0],
+        }
+
+    def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
+        return collected_value(instances, actions)
+
+    def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
+        return collected_value(instances, actions[..., None])
+
+    def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
+        return (actions != DEPOT).sum(-1) + 1
+
+    def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
+        return [[node - 1 for node in actions if node != DEPOT]]
+
+
+class RoutePlanningEnv(ProblemEnv):
+    """
+    Route planning of one UAV as a Gymnasium environment (``RoutePlanning-N{N}-v0``).
+
+    :param n_tasks: Number of tasks
+    :param max_distance: Maximum flight distance
+    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
+    :param generator: Any other source of instances
+    :param render_mode: ``"human"``, ``"rgb_array"`` or None
+    """
+
+    def __init__(
+        self,
+        n_tasks: int = 20,
+        max_distance: float = 2.0,
+        distribution: str = "uniform",
+        instances: Any = None,
+        generator: InstanceGenerator | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        generator = generator or make_generator(n_tasks, 1, max_distance, distribution, instances)
+        super().__init__(RoutingProblem(generator), render_mode)

@@ -1,0 +1,124 @@
+"""Schedules, and the one independent check that every solver's schedules must pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances
+
+
+class InfeasibleScheduleError(ValueError):
+    """A schedule breaks a constraint of its instance."""
+
+
+@dataclass(frozen=True, init=False)
+class Schedule:
+    """
+    One route per UAV; every route starts and ends in the depot, which is not listed.
+
+    :param routes: Task indices from 0, in flying order
+    """
+
+    routes: tuple[tuple[int, ...], ...]
+
+    def __init__(self, routes: Iterable[Iterable[int]]) -> None:
+        object.__setattr__(self, "routes", tuple(tuple(int(task) for task in route) for route in routes))
+
+    @property
+    def n_visited(self) -> int:
+        return sum(len(route) for route in self.routes)
+
+
+@dataclass(frozen=True)
+class ScheduleReport:
+    """
+    What a checked schedule achieves.
+
+    :param objective: Total value of the visited tasks
+    :param lengths: Length of every UAV's closed tour, in the unit of the coordinates
+    """
+
+    objective: float
+    lengths: tuple[float, ...]
+
+    @property
+    def length(self) -> float:
+        return math.fsum(self.lengths)
+
+
+def check_schedule(instances: Instances, row: int, schedule: Schedule) -> ScheduleReport:
+    """
+    Check a schedule against its instance (paper, equations (1) to (6)), in plain Python floats.
+
+    Written without any of the dynamics' code, so that a fault there cannot hide here.
+
+    :param instances: The instances
+    :param row: Which of them
+    :param schedule: The schedule
+    :return: Objective and tour lengths
+    :raises InfeasibleScheduleError: If a constraint is broken; the message says which, where and by how much
+    """
+    depot = [float(x) for x in instances.depot[row].tolist()]
+    tasks = instances.tasks[row].tolist()
+    values = instances.values[row].tolist()
+    n_tasks = sum(instances.task_mask[row].tolist())
+    max_distance = float(instances.max_distance[row])
+    if len(schedule.routes) > instances.n_uavs:
+        raise InfeasibleScheduleError(f"{len(schedule.routes)} routes for a fleet of {instances.n_uavs} UAVs.")
+    seen: dict[int, int] = {}
+    lengths = []
+    for uav, route in enumerate(schedule.routes):
+        for task in route:
+            if not 0 <= task < n_tasks:
+                raise InfeasibleScheduleError(f"UAV {uav} visits task {task}, but tasks are numbered 0 to {n_tasks - 1}.")
+            if task in seen:
+                raise InfeasibleScheduleError(f"Task {task} is visited twice, by UAV {seen[task]} and UAV {uav}.")
+            seen[task] = uav
+        stops = [depot, *(tasks[task] for task in route), depot]
+        length = 0.0
+        for a, b in zip(stops, stops[1:], strict=False):
+            length += math.hypot(a[0] - b[0], a[1] - b[1])
+        if not length <= max_distance + DISTANCE_TOLERANCE * max(max_distance, 1.0):
+            raise InfeasibleScheduleError(
+                f"UAV {uav} flies {length:.9f}, which is {length - max_distance:.3g} over its maximum of {max_distance:.9f}."
+            )
+        lengths.append(length)
+    return ScheduleReport(math.fsum(values[task] for task in seen), tuple(lengths))
+
+
+def schedule_to_json(solver: str, row: int, schedule: Schedule, report: ScheduleReport) -> dict[str, Any]:
+    """
+    :param solver: Name of the solver
+    :param row: Index of the instance
+    :param schedule: The schedule
+    :param report: What :func:`check_schedule` said of it
+    :return: One line of a ``schedules.jsonl``
+    """
+    return {
+        "solver": solver,
+        "instance": row,
+        "routes": [list(route) for route in schedule.routes],
+        "objective": report.objective,
+        "lengths": list(report.lengths),
+    }
+
+
+def schedule_from_json(record: Any, source: str) -> tuple[str, int, Schedule]:
+    """
+    :param record: One parsed line of a ``schedules.jsonl``
+    :param source: File and line, named in errors
+    :return: Solver, index of the instance, schedule
+    :raises ValueError: If a field is missing or of the wrong type
+    """
+    if not isinstance(record, dict) or not {"solver", "instance", "routes"} <= set(record):
+        raise ValueError(f"{source}: a schedule needs the fields 'solver', 'instance' and 'routes', found {record!r:.80}.")
+    routes = record["routes"]
+    whole = isinstance(routes, Sequence) and all(
+        isinstance(route, list) and all(type(task) is int for task in route) for route in routes
+    )
+    if not whole or type(record["instance"]) is not int:
+        raise ValueError(f"{source}: 'routes' must be lists of task indices and 'instance' an index, found {routes!r:.80}.")
+    return str(record["solver"]), record["instance"], Schedule(routes)

@@ -1,0 +1,180 @@
+"""``BatchedVecEnv``: one SB3 ``VecEnv`` that steps thousands of instances in lock step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_uav.envs.gym_env import ProblemEnv, set_generator
+from sb3_uav.envs.problem import Episodes, Problem, given_instance
+
+# Wrappers that change nothing here: episodes end by themselves before any time limit, and episode statistics are kept below.
+TRANSPARENT_WRAPPERS = (Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker)
+
+
+def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
+    """
+    :param env: An environment
+    :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper around it changes what it does
+    """
+    inner: Any = env
+    while isinstance(inner, TRANSPARENT_WRAPPERS):
+        inner = inner.env
+    return inner if isinstance(inner, ProblemEnv) else None
+
+
+class BatchedVecEnv(VecEnv):
+    """
+    A drop-in for ``DummyVecEnv`` that steps all its episodes with one batched tensor operation.
+
+    Seeded alike, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it says
+    what the problem is, and its ``Monitor``, if it has a file, logs the episodes of row 0. Every episode's statistics are in
+    ``infos[i]["episode"]``, as with ``Monitor``.
+
+    :param env_fns: Functions that make the environment, as for ``DummyVecEnv``; one per row
+    :raises ValueError: If the functions do not make one of our environments, or wrap it in something that changes it
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
+        env = env_fns[0]()
+        problem_env = unwrap_problem_env(env)
+        if problem_env is None:
+            raise ValueError(f"BatchedVecEnv cannot batch {env}; use stable_baselines3's DummyVecEnv for it.")
+        self.template = problem_env
+        self.problem: Problem = problem_env.problem
+        self._monitor = env if isinstance(env, Monitor) else None
+        self.episodes = Episodes(self.problem, len(env_fns))
+        self._start_time = time.time()
+        self._actions = np.zeros(len(env_fns), dtype=np.int64)
+        super().__init__(len(env_fns), problem_env.observation_space, problem_env.action_space)
+        self._episode_returns = np.zeros(self.num_envs)
+        self._episode_lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._n_illegal = np.zeros(self.num_envs, dtype=np.int64)
+
+    def reset(self) -> VecEnvObs:
+        given = {}
+        for row, (seed, options) in enumerate(zip(self._seeds, self._options, strict=True)):
+            if seed is not None:
+                self.episodes.seed(row, seed)
+            instance = given_instance(options)
+            if instance is not None:
+                given[row] = instance
+        self.episodes.reset(given=given)
+        for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
+            counter[:] = 0
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return self.episodes.observation()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        result = self.episodes.step(self._actions)
+        self._episode_returns += result.rewards
+        self._episode_lengths += 1
+        self._n_illegal += result.illegal
+        infos: list[dict[str, Any]] = [{"illegal_actions": n} for n in self._n_illegal.tolist()]
+        finished = result.dones.nonzero()[0]
+        observation = result.observation
+        if len(finished) > 0:
+            for row in finished:
+                infos[row]["terminal_observation"] = {key: value[row] for key, value in observation.items()}
+                infos[row]["TimeLimit.truncated"] = False
+                infos[row]["objective"] = float(self._episode_returns[row])
+                infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
+            if 0 in finished:
+                self.log_episode(infos[0]["episode"])
+            for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
+                counter[finished] = 0
+            self.episodes.reset(finished)
+            observation = self.episodes.observation()
+        return observation, result.rewards.astype(np.float32), result.dones.copy(), infos
+
+    def episode_info(self, episode_return: float, length: int) -> dict[str, float]:
+        """Episode statistics in the form of SB3's ``Monitor``."""
+        elapsed = round(time.time() - self._start_time, 6)
+        return {"r": round(float(episode_return), 6), "l": int(length), "t": elapsed}
+
+    def log_episode(self, episode_info: dict[str, float]) -> None:
+        """Write a row to the monitor file, if there is one."""
+        if self._monitor is not None and self._monitor.results_writer is not None:
+            self._monitor.results_writer.write_row(episode_info)
+
+    def action_masks(self) -> np.ndarray:
+        """``(n_envs, n_actions)`` bool, True where an action is legal."""
+        return self.episodes.action_masks()
+
+    def set_generator(self, generator: Any) -> None:
+        """Draw the instances of the next episodes from another source of the same size."""
+        set_generator(self.problem, generator)
+
+    def close(self) -> None:
+        if self._monitor is not None:
+            self._monitor.close()
+        self.template.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        if self.render_mode != "rgb_array":
+            return [None for _ in range(self.num_envs)]
+        return self._images(range(self.num_envs))
+
+    def _images(self, rows: Iterable[int]) -> list[np.ndarray]:
+        from sb3_uav.envs.render import MapFigure
+
+        figure = MapFigure()
+        images = []
+        for row in rows:
+            figure.draw(self.episodes.instances, row, self.episodes.routes(row))
+            images.append(figure.rgb_array())
+        return images
+
+    def has_attr(self, attr_name: str) -> bool:
+        return hasattr(self.template, attr_name)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of the one shared environment, once per row."""
+        return [getattr(self.template, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        Set an attribute of the one shared environment.
+
+        :raises ValueError: If only some rows are named, because all rows share it
+        """
+        self._require_all_rows(indices, f"set {attr_name}")
+        setattr(self.template, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        Call a method of every row's environment; ``action_masks`` and ``render`` answer row by row.
+
+        :raises ValueError: If only some rows are named for a method that they share
+        """
+        rows = list(self._get_indices(indices))
+        if method_name == "action_masks":
+            masks = self.action_masks()
+            return [masks[row] for row in rows]
+        if method_name == "render":
+            return list(self._images(rows))
+        self._require_all_rows(indices, f"call {method_name}")
+        result = getattr(self.template, method_name)(*method_args, **method_kwargs)
+        return [result for _ in rows]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """True for ``Monitor``, whose statistics this class provides; other wrappers are refused in the constructor."""
+        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
+
+    def _require_all_rows(self, indices: VecEnvIndices, action: str) -> None:
+        if set(self._get_indices(indices)) != set(range(self.num_envs)):
+            raise ValueError(f"Cannot {action} for rows {indices} alone: the rows of a BatchedVecEnv share one environment.")

@@ -1,0 +1,5 @@
+from sb3_uav.policies.allocator import AllocatorExtractor, AllocatorPolicy
+from sb3_uav.policies.base import EpisodicPolicy
+from sb3_uav.policies.router import RouterExtractor, RouterPolicy
+
+__all__ = ["AllocatorExtractor", "AllocatorPolicy", "EpisodicPolicy", "RouterExtractor", "RouterPolicy"]

@@ -1,0 +1,426 @@
+"""
+Policies that encode an instance once and decode it many times.
+
+``encode(instances) -> cache`` and ``decode_step(cache, state) -> logits, values`` are the only places that compute logits
+(DESIGN, decision 4). SB3's step loop reaches them through :meth:`EpisodicPolicy._decode_observation`; the fused driver
+through :meth:`EpisodicPolicy.decode_episodes` and :meth:`EpisodicPolicy.evaluate_episodes`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.common.maskable.distributions import MaskableDistribution
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule, TensorDict
+from stable_baselines3.common.utils import get_device
+from torch import nn
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
+
+# The settings of the encoder, by preset; arguments of the policy override them one by one.
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="layer", use_values=True),
+    # Section IV-A2 of the paper and DESIGN section 5.
+    "paper": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch", use_values=False),
+}
+
+
+class Cache(NamedTuple):
+    """
+    What decoding needs of an encoded instance. Every tensor leads with the batch dimension.
+
+    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
+    :param projections: What a decoder precomputes from them, or nothing
+    """
+
+    nodes: th.Tensor
+    projections: tuple[th.Tensor, ...] = ()
+
+    def detach(self) -> Cache:
+        return Cache(self.nodes.detach(), tuple(projection.detach() for projection in self.projections))
+
+    def update_rows(self, rows: th.Tensor, fresh: Cache) -> Cache:
+        """
+        :param rows: ``(n,)`` int64
+        :param fresh: A cache of ``n`` instances to put into these rows
+        """
+        return Cache(
+            self.nodes.index_copy(0, rows, fresh.nodes),
+            tuple(old.index_copy(0, rows, new) for old, new in zip(self.projections, fresh.projections, strict=True)),
+        )
+
+
+class EpisodeEvaluation(NamedTuple):
+    """
+    Complete episodes in the eyes of the current policy; every tensor is ``(batch, n_samples, n_steps)``.
+
+    :param log_prob: Log-probability of each action; 0 in steps after the end
+    :param values: The critic's estimate before each action
+    :param entropy: Entropy of the masked distribution of each action
+    """
+
+    log_prob: th.Tensor
+    values: th.Tensor
+    entropy: th.Tensor
+
+
+class EpisodicExtractor(BaseFeaturesExtractor):
+    """
+    An attention encoder and the part of the decoder before the action distribution, as an SB3 features extractor.
+
+    In evaluation mode and without gradients it keeps the encodings of the last batch and encodes only rows whose static part
+    has changed: once per episode instead of once per step. Training mode, loading parameters and moving to another device
+    clear that cache; so must whoever changes parameters in another way (:meth:`clear_cache`).
+
+    :param observation_space: Of one of our environments
+    :param features_dim: Size of the features
+    :param encoder_kwargs: Arguments of :class:`~sb3_uav.policies.encoder.AttentionEncoder`
+    """
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int, **encoder_kwargs: Any) -> None:
+        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
+            raise ValueError(
+                f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}."
+            )
+        super().__init__(observation_space, features_dim)
+        self.encoder = AttentionEncoder(**encoder_kwargs)
+        self.use_cache = True
+        self.n_encoded_rows = 0
+        self._cached: tuple[StaticObservation, Cache] | None = None
+
+    @abstractmethod
+    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
+        """
+        :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
+        :param static: What they were made from
+        :return: Everything that decoding needs
+        """
+
+    @abstractmethod
+    def observed_state(self, cache: Cache, observation: TensorDict) -> Any:
+        """
+        :param cache: Of ``batch`` instances
+        :param observation: ``batch`` preprocessed observations
+        :return: The decoder's state with one sample per instance
+        """
+
+    @abstractmethod
+    def decode(self, cache: Cache, state: Any) -> th.Tensor:
+        """
+        :param cache: Of ``batch`` instances
+        :param state: The decoder's state, ``(batch, n_samples, ...)``
+        :return: Features ``(batch, n_samples, features)``
+        """
+
+    def encode(self, static: StaticObservation) -> Cache:
+        """
+        :param static: ``batch`` instances
+        :return: Their encodings
+        """
+        self.n_encoded_rows += len(static.depot)
+        return self.precompute(self.encoder(static), static)
+
+    def forward(self, observations: TensorDict) -> th.Tensor:
+        """
+        :param observations: ``batch`` preprocessed observations
+        :return: ``(batch, features_dim)``
+        """
+        cache = self._encode_cached(StaticObservation.from_observation(observations))
+        return self.decode(cache, self.observed_state(cache, observations))[:, 0]
+
+    def _encode_cached(self, static: StaticObservation) -> Cache:
+        if self.training or th.is_grad_enabled() or not self.use_cache:
+            return self.encode(static)
+        if self._cached is None or self._cached[0].tasks.shape != static.tasks.shape:
+            cache = self.encode(static)
+        else:
+            known, cache = self._cached
+            changed = th.stack([(old != new).flatten(1).any(1) for old, new in zip(known, static, strict=True)]).any(0)
+            rows = changed.nonzero()[:, 0]
+            if len(rows) == len(changed):
+                cache = self.encode(static)
+            elif len(rows) > 0:
+                cache = cache.update_rows(rows, self.encode(StaticObservation(*(field[rows] for field in static))))
+        self._cached = (static, cache)
+        return cache
+
+    def clear_cache(self) -> None:
+        """Forget the kept encodings."""
+        self._cached = None
+
+    def train(self, mode: bool = True) -> EpisodicExtractor:
+        if mode:
+            self.clear_cache()
+        return super().train(mode)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> EpisodicExtractor:
+        self.clear_cache()
+        return super()._apply(*args, **kwargs)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.clear_cache()
+        super()._load_from_state_dict(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cached": None}
+
+
+def sample_actions(logits: th.Tensor, deterministic: bool, generator: th.Generator | None) -> th.Tensor:
+    """
+    Choose actions; one of probability 0 is never chosen.
+
+    :param logits: ``(..., n_actions)``, -inf where an action is illegal
+    :param deterministic: Whether to take the most probable action instead of sampling
+    :param generator: Source of randomness, on the device of the logits
+    :return: ``(...)`` int64
+    """
+    if deterministic:
+        return logits.argmax(-1)
+    # Gumbel-max: illegal actions stay at -inf, and the exponential draw is never 0.
+    noise = th.empty_like(logits).exponential_(generator=generator)
+    return (logits - noise.clamp(min=th.finfo(logits.dtype).tiny).log()).argmax(-1)
+
+
+class EpisodicPolicy(MaskableActorCriticPolicy):
+    """
+    A masked categorical actor-critic policy with attention, for stock PPO, A2C and MaskablePPO and for our REINFORCE.
+
+    The mask comes from ``observation["action_mask"]`` when the algorithm passes no ``action_masks``, so it cannot be forgotten.
+    Its networks work for any number of tasks; the observation space binds only SB3's step loop to one.
+
+    :param observation_space: Of one of our environments
+    :param action_space: Of the same environment
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param preset: ``"default"``, or ``"paper"`` for the network of the paper
+    :param embed_dim: Size of the embeddings; the preset's when None, like the next five
+    :param n_layers: Number of attention layers
+    :param n_heads: Number of heads
+    :param ff_dim: Hidden size of the feed-forward sublayers
+    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    :param use_values: Whether task values are features of the encoder
+    :param net_arch: Hidden layers between features and heads, as in SB3; none by default
+    :param activation_fn: Activation function of ``net_arch``
+    :param ortho_init: Whether to use SB3's orthogonal initialization
+    :param use_sde: Must be False; stock PPO and A2C pass it
+    :param optimizer_class: The optimizer to use
+    :param optimizer_kwargs: Additional keyword arguments of the optimizer
+    """
+
+    extractor_class: ClassVar[type[EpisodicExtractor]]
+    features_extractor: EpisodicExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        preset: str = "default",
+        embed_dim: int | None = None,
+        n_layers: int | None = None,
+        n_heads: int | None = None,
+        ff_dim: int | None = None,
+        normalization: str | None = None,
+        use_values: bool | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        ortho_init: bool = False,
+        use_sde: bool = False,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if use_sde:
+            raise ValueError("use_sde must be False: state-dependent exploration is for continuous actions.")
+        if preset not in PRESETS:
+            raise ValueError(f"preset is {preset!r}; choose one of {sorted(PRESETS)}.")
+        given = dict(
+            embed_dim=embed_dim,
+            n_layers=n_layers,
+            n_heads=n_heads,
+            ff_dim=ff_dim,
+            normalization=normalization,
+            use_values=use_values,
+        )
+        self._own_parameters: dict[str, Any] = {"preset": preset, **given}
+        settings = {**PRESETS[preset], **{key: value for key, value in given.items() if value is not None}}
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=[] if net_arch is None else net_arch,
+            activation_fn=activation_fn,
+            ortho_init=ortho_init,
+            features_extractor_class=self.extractor_class,
+            features_extractor_kwargs=settings,
+            normalize_images=False,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for key in ("features_extractor_class", "features_extractor_kwargs", "normalize_images", "squash_output"):
+            data.pop(key, None)
+        return {**data, **self._own_parameters}
+
+    @classmethod
+    @abstractmethod
+    def placeholder_spaces(cls, n_actions: int | None) -> tuple[spaces.Dict, spaces.Discrete]:
+        """
+        Spaces of some small instance, for a policy that will only be used through the fused driver.
+
+        :param n_actions: Number of actions where the network is bound to it
+        :return: Observation space, action space
+        """
+
+    # ---------------------------------------------------------------------------------------------------- decoding
+
+    @abstractmethod
+    def _heads(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: ``(..., features)``
+        :return: Unmasked logits ``(..., n_actions)``, values ``(...)``
+        """
+
+    def encode(self, instances: Instances) -> Cache:
+        """
+        :param instances: ``batch`` instances on the device of the policy
+        :return: Their encodings
+        """
+        return self.features_extractor.encode(StaticObservation.from_instances(instances))
+
+    def decode_step(self, cache: Cache, state: Any) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param cache: Encodings of ``batch`` instances
+        :param state: The decoder's state with ``n_samples`` episodes (or steps of episodes) per instance
+        :return: Unmasked logits ``(batch, n_samples, n_actions)``, values ``(batch, n_samples)``
+        """
+        return self._heads(self.features_extractor.decode(cache, state))
+
+    @abstractmethod
+    def _decode_episodes(
+        self, instances: Instances, cache: Cache, n_samples: int, deterministic: bool, generator: th.Generator | None
+    ) -> th.Tensor:
+        """The level's part of :meth:`decode_episodes`."""
+
+    @abstractmethod
+    def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[Any, th.Tensor]:
+        """
+        The decoder's states before every action of complete episodes.
+
+        :param instances: ``batch`` instances
+        :param cache: Their encodings
+        :param actions: ``(batch, n_samples, n_steps)`` int64
+        :return: The states, ``(batch, n_samples * n_steps, ...)``, and their action masks
+        """
+
+    @th.no_grad()
+    def decode_episodes(
+        self,
+        instances: Instances,
+        n_samples: int = 1,
+        deterministic: bool = True,
+        generator: th.Generator | None = None,
+        cache: Cache | None = None,
+    ) -> th.Tensor:
+        """
+        Play complete episodes on the policy's device, without an environment.
+
+        :param instances: ``batch`` instances on the device of the policy
+        :param n_samples: Episodes per instance, all from one encoding
+        :param deterministic: Whether to take the most probable action instead of sampling
+        :param generator: Source of randomness, on the same device
+        :param cache: The encodings, if there are any already
+        :return: Actions ``(batch, n_samples, n_steps)`` int64
+        """
+        cache = self.encode(instances) if cache is None else cache.detach()
+        return self._decode_episodes(instances, cache, n_samples, deterministic, generator)
+
+    def evaluate_episodes(self, instances: Instances, actions: th.Tensor, cache: Cache | None = None) -> EpisodeEvaluation:
+        """
+        Evaluate all actions of complete episodes in one parallel pass, with gradients.
+
+        :param instances: ``batch`` instances on the device of the policy
+        :param actions: ``(batch, n_samples, n_steps)`` int64, legal ones
+        :param cache: The encodings, if there are any already
+        :return: Log-probabilities, values and entropies
+        """
+        cache = self.encode(instances) if cache is None else cache
+        state, action_mask = self._episode_states(instances, cache, actions)
+        logits, values = self.decode_step(cache, state)
+        log_probs = logits.masked_fill(~action_mask, -th.inf).log_softmax(-1)
+        log_prob = log_probs.gather(-1, actions.flatten(1)[..., None]).squeeze(-1)
+        # 0 * -inf is NaN, in the gradient too, so illegal actions are taken out before the product.
+        legal_log_probs = log_probs.masked_fill(~action_mask, 0.0)
+        entropy = -(legal_log_probs.exp() * legal_log_probs).sum(-1)
+        return EpisodeEvaluation(*(field.view(actions.shape) for field in (log_prob, values, entropy)))
+
+    # ---------------------------------------------------------------------------------------------------- SB3's step loop
+
+    def _decode_observation(
+        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
+    ) -> tuple[MaskableDistribution, th.Tensor]:
+        """
+        :param obs: ``batch`` observations
+        :param action_masks: The mask of each; that of the observation when None
+        :return: The masked distribution, and the values ``(batch,)``
+        """
+        assert isinstance(obs, dict)
+        features = BasePolicy.extract_features(self, obs, self.features_extractor)
+        logits, values = self._heads(features)
+        distribution = self.action_dist.proba_distribution(action_logits=logits)
+        distribution.apply_masking(obs["action_mask"].bool() if action_masks is None else action_masks)
+        return distribution, values
+
+    def forward(  # type: ignore[override]
+        self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        distribution, values = self._decode_observation(obs, action_masks)
+        actions = distribution.get_actions(deterministic=deterministic)
+        return actions, values[:, None], distribution.log_prob(actions)
+
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: PyTorchObs, actions: th.Tensor, action_masks: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        distribution, values = self._decode_observation(obs, action_masks)
+        return values[:, None], distribution.log_prob(actions), distribution.entropy()
+
+    def get_distribution(self, obs: PyTorchObs, action_masks: np.ndarray | None = None) -> MaskableDistribution:
+        return self._decode_observation(obs, action_masks)[0]
+
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        return self._decode_observation(obs, None)[1][:, None]
+
+    # ---------------------------------------------------------------------------------------------------- parameters
+
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        self.features_extractor.clear_cache()
+        super().load_from_vector(vector)
+
+    @classmethod
+    def from_parameters(cls, parameters: dict[str, th.Tensor], policy_kwargs: dict[str, Any], device: Any) -> Any:
+        """
+        Build a policy for the fused driver from a state dict.
+
+        :param parameters: The state dict of a policy of this class
+        :param policy_kwargs: The arguments it was built with
+        :param device: Where to put it
+        :return: The policy, in evaluation mode
+        :raises ValueError: If the state dict does not fit the arguments
+        """
+        weight = parameters.get("action_net.weight")
+        observation_space, action_space = cls.placeholder_spaces(None if weight is None else len(weight))
+        policy = cls(observation_space, action_space, lambda _: 0.0, **policy_kwargs)
+        try:
+            policy.load_state_dict(parameters)
+        except RuntimeError as error:
+            raise ValueError(f"the parameters are not those of a {cls.__name__}({policy_kwargs}): {error}") from error
+        policy.set_training_mode(False)
+        return policy.to(get_device(device))

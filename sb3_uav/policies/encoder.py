@@ -1,0 +1,210 @@
+"""The attention encoder of both levels (paper, section IV-A2), aware of padding."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
+
+from sb3_uav.envs.instances import Instances
+
+NORMALIZATIONS = ("batch", "layer", "none")
+
+
+class StaticObservation(NamedTuple):
+    """
+    What an episode keeps, float32 on the network's device.
+
+    :param depot: ``(batch, 2)``
+    :param tasks: ``(batch, n_tasks, 2)``
+    :param values: ``(batch, n_tasks)``
+    :param task_mask: ``(batch, n_tasks)`` bool, True for real tasks
+    :param max_distance: ``(batch, 1)``
+    """
+
+    depot: th.Tensor
+    tasks: th.Tensor
+    values: th.Tensor
+    task_mask: th.Tensor
+    max_distance: th.Tensor
+
+    @classmethod
+    def from_observation(cls, observation: TensorDict) -> StaticObservation:
+        """:param observation: A batch of preprocessed observations"""
+        return cls(
+            depot=observation["depot"],
+            tasks=observation["tasks"].view(len(observation["tasks"]), -1, 2),
+            values=observation["values"],
+            task_mask=observation["task_mask"].bool(),
+            max_distance=observation["max_distance"],
+        )
+
+    @classmethod
+    def from_instances(cls, instances: Instances) -> StaticObservation:
+        """:param instances: Instances on the network's device"""
+        return cls(
+            depot=instances.depot.float(),
+            tasks=instances.tasks.float(),
+            values=instances.values.float(),
+            task_mask=instances.task_mask,
+            max_distance=instances.max_distance.float()[:, None],
+        )
+
+
+class NodeNorm(nn.Module):
+    """
+    Normalization of node embeddings that leaves padded nodes out.
+
+    Batch normalization is the paper's. Its statistics differ between acting and training, which breaks PPO's ratios, so it is
+    the default of the ``paper`` preset only (see DESIGN, decision 9).
+
+    :param kind: ``"batch"``, ``"layer"`` or ``"none"``
+    :param embed_dim: Size of the embeddings
+    """
+
+    def __init__(self, kind: str, embed_dim: int) -> None:
+        super().__init__()
+        if kind not in NORMALIZATIONS:
+            raise ValueError(f"normalization is {kind!r}; choose one of {NORMALIZATIONS}.")
+        self.norm: nn.Module = nn.Identity()
+        if kind == "batch":
+            self.norm = nn.BatchNorm1d(embed_dim)
+        elif kind == "layer":
+            self.norm = nn.LayerNorm(embed_dim)
+
+    def forward(self, nodes: th.Tensor, node_mask: th.Tensor | None) -> th.Tensor:
+        """
+        :param nodes: ``(batch, n_nodes, embed_dim)``
+        :param node_mask: ``(batch, n_nodes)`` bool, or None when all are real
+        :return: ``(batch, n_nodes, embed_dim)``
+        """
+        if not isinstance(self.norm, nn.BatchNorm1d):
+            return self.norm(nodes)
+        if node_mask is None:
+            return self.norm(nodes.flatten(0, 1)).view_as(nodes)
+        return nodes.masked_scatter(node_mask[..., None], self.norm(nodes[node_mask]))
+
+
+class SelfAttention(nn.Module):
+    """
+    Multi-head self-attention without biases (paper, equations (11) to (13)).
+
+    :param embed_dim: Size of the embeddings
+    :param n_heads: Number of heads
+    """
+
+    def __init__(self, embed_dim: int, n_heads: int) -> None:
+        super().__init__()
+        if embed_dim % n_heads != 0:
+            raise ValueError(f"embed_dim {embed_dim} must be a multiple of n_heads {n_heads}.")
+        self.n_heads = n_heads
+        self.project_in = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
+        self.project_out = nn.Linear(embed_dim, embed_dim, bias=False)
+
+    def forward(self, nodes: th.Tensor, attention_bias: th.Tensor | None) -> th.Tensor:
+        """
+        :param nodes: ``(batch, n_nodes, embed_dim)``
+        :param attention_bias: ``(batch, 1, 1, n_nodes)``, 0 for real and -inf for padded nodes, or None
+        :return: ``(batch, n_nodes, embed_dim)``
+        """
+        query, key, value = self.project_in(nodes).chunk(3, dim=-1)
+        return self.project_out(attend(query, key, value, self.n_heads, attention_bias))
+
+
+def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, attention_bias: th.Tensor | None) -> th.Tensor:
+    """
+    Scaled dot-product attention of several heads.
+
+    Products are written out: measured on CPU, they beat ``scaled_dot_product_attention`` at these small head sizes
+    (``benchmarks/attention.py``).
+
+    :param query: ``(batch, n_queries, embed_dim)``
+    :param key: ``(batch, n_nodes, embed_dim)``
+    :param value: ``(batch, n_nodes, embed_dim)``
+    :param n_heads: Number of heads
+    :param attention_bias: Added to the scores, broadcast against ``(batch, n_heads, n_queries, n_nodes)``, or None
+    :return: ``(batch, n_queries, embed_dim)``
+    """
+    query = query.unflatten(-1, (n_heads, -1)).transpose(1, 2)
+    key = key.unflatten(-1, (n_heads, -1)).permute(0, 2, 3, 1)
+    value = value.unflatten(-1, (n_heads, -1)).transpose(1, 2)
+    scores = (query / math.sqrt(query.shape[-1])) @ key
+    if attention_bias is not None:
+        scores = scores + attention_bias
+    return (scores.softmax(-1) @ value).transpose(1, 2).flatten(2)
+
+
+class AttentionLayer(nn.Module):
+    """
+    Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (14), (15)).
+
+    :param embed_dim: Size of the embeddings
+    :param n_heads: Number of heads
+    :param ff_dim: Hidden size of the feed-forward sublayer
+    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    """
+
+    def __init__(self, embed_dim: int, n_heads: int, ff_dim: int, normalization: str) -> None:
+        super().__init__()
+        self.attention = SelfAttention(embed_dim, n_heads)
+        self.attention_norm = NodeNorm(normalization, embed_dim)
+        self.feed_forward = nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
+        self.feed_forward_norm = NodeNorm(normalization, embed_dim)
+
+    def forward(self, nodes: th.Tensor, node_mask: th.Tensor | None, attention_bias: th.Tensor | None) -> th.Tensor:
+        """
+        :param nodes: ``(batch, n_nodes, embed_dim)``
+        :param node_mask: ``(batch, n_nodes)`` bool, or None when all are real
+        :param attention_bias: The same as 0 and -inf, ``(batch, 1, 1, n_nodes)``, or None
+        :return: ``(batch, n_nodes, embed_dim)``
+        """
+        nodes = self.attention_norm(nodes + self.attention(nodes, attention_bias), node_mask)
+        return self.feed_forward_norm(nodes + self.feed_forward(nodes), node_mask)
+
+
+class AttentionEncoder(nn.Module):
+    """
+    Embeds depot and tasks.
+
+    :param embed_dim: Size of the embeddings
+    :param n_layers: Number of attention layers
+    :param n_heads: Number of heads
+    :param ff_dim: Hidden size of the feed-forward sublayers
+    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    :param use_values: Whether the value of a task is a feature beside its coordinates (the paper's tasks are all worth 1)
+    """
+
+    def __init__(
+        self,
+        embed_dim: int = 128,
+        n_layers: int = 3,
+        n_heads: int = 8,
+        ff_dim: int = 512,
+        normalization: str = "layer",
+        use_values: bool = True,
+    ) -> None:
+        super().__init__()
+        self.use_values = use_values
+        self.embed_depot = nn.Linear(2, embed_dim)
+        self.embed_task = nn.Linear(3 if use_values else 2, embed_dim)
+        self.layers = nn.ModuleList(AttentionLayer(embed_dim, n_heads, ff_dim, normalization) for _ in range(n_layers))
+
+    def forward(self, static: StaticObservation) -> th.Tensor:
+        """
+        :param static: The unchanging part of a batch of observations
+        :return: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first; those of padded tasks mean nothing
+        """
+        features = static.tasks
+        if self.use_values:
+            features = th.cat([features, static.values[..., None]], dim=-1)
+        nodes = th.cat([self.embed_depot(static.depot)[:, None], self.embed_task(features)], dim=1)
+        node_mask, attention_bias = None, None
+        if not static.task_mask.all():
+            node_mask = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)
+            attention_bias = th.zeros_like(node_mask, dtype=nodes.dtype).masked_fill(~node_mask, -th.inf)[:, None, None]
+        for layer in self.layers:
+            nodes = layer(nodes, node_mask, attention_bias)
+        return nodes

@@ -1,0 +1,37 @@
+"""Environment ids. Importing this module needs gymnasium alone; the environments are imported when they are made."""
+
+import gymnasium as gym
+
+PAPER_FLEETS = (4, 6)
+PAPER_SIZES = (80, 100, 150, 200, 300, 500)
+GENERALISATION_SIZES = (600, 700, 800, 900, 1000, 1500)
+DEMO_FLEET, DEMO_SIZE = 3, 20
+
+
+def allocation_id(n_uavs: int, n_tasks: int) -> str:
+    return f"TaskAllocation-U{n_uavs}-N{n_tasks}-v0"
+
+
+def routing_id(n_tasks: int) -> str:
+    return f"RoutePlanning-N{n_tasks}-v0"
+
+
+def register_envs() -> None:
+    """Register every scenario of the paper and the small one of the demo; registering twice changes nothing."""
+    sizes = (*PAPER_SIZES, *GENERALISATION_SIZES)
+    scenarios = [(n_uavs, n_tasks) for n_uavs in PAPER_FLEETS for n_tasks in sizes]
+    for n_uavs, n_tasks in (*scenarios, (DEMO_FLEET, DEMO_SIZE)):
+        _register(allocation_id(n_uavs, n_tasks), "allocation:TaskAllocationEnv", n_tasks, n_uavs=n_uavs)
+    for n_tasks in (*sizes, DEMO_SIZE):
+        _register(routing_id(n_tasks), "routing:RoutePlanningEnv", n_tasks)
+
+
+def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: int) -> None:
+    if env_id not in gym.registry:
+        gym.register(
+            id=env_id,
+            entry_point=f"sb3_uav.envs.{entry_point}",
+            # Episodes end by themselves after at most n_tasks + 1 steps: this limit is never reached.
+            max_episode_steps=n_tasks + 2,
+            kwargs={"n_tasks": n_tasks, **kwargs},
+        )

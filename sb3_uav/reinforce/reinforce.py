@@ -1,0 +1,455 @@
+"""REINFORCE (paper, section IV-C) as an SB3 on-policy algorithm."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.problem import Problem
+from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
+from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
+from sb3_uav.policies.base import Cache
+from sb3_uav.reinforce.baselines import ACTION_STREAM, BASELINES, TRAINING_STREAM, Baseline
+
+SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
+
+# Larger than any run; learn_instances stops by instances, not by steps.
+NO_STEP_LIMIT = 2**62
+
+
+class EpisodeBatch(NamedTuple):
+    """
+    Complete episodes waiting for the gradient pass.
+
+    :param instances: ``batch`` instances
+    :param cache: Their encodings, with gradients
+    :param actions: ``(batch, n_samples, n_steps)`` int64
+    :param returns: ``(batch, n_samples)`` float64
+    :param baseline: Broadcastable against ``returns``
+    """
+
+    instances: Instances
+    cache: Cache
+    actions: th.Tensor
+    returns: th.Tensor
+    baseline: th.Tensor
+
+
+class REINFORCE(OnPolicyAlgorithm):
+    """
+    REINFORCE with a choice of baselines.
+
+    On our environments with our policies it plays whole episodes of ``n_envs`` instances at a time on the policy's device (the
+    fused driver): one encoding, ``n_samples`` episodes per instance, one gradient pass over all their steps, one update.
+    On any other environment it collects ``n_steps`` per env with SB3's loop and learns from the episodes completed in there;
+    the baselines ``shared`` and ``rollout``, which replay instances, are then not available.
+
+    :param policy: The policy model to use (MlpPolicy, AllocatorPolicy, RouterPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: The learning rate, it can be a function of the current progress remaining (from 1 to 0)
+    :param n_steps: Steps per env and update in SB3's loop; the fused driver always plays whole episodes
+    :param n_samples: Episodes per instance and update (fused driver)
+    :param baseline: ``"none"``, ``"exponential"``, ``"shared"`` (mean over the samples of an instance), ``"critic"`` or
+        ``"rollout"`` (the paper's)
+    :param baseline_kwargs: Arguments of the baseline, see :mod:`sb3_uav.reinforce.baselines`
+    :param instances_per_epoch: Instances per epoch; after each the rollout baseline is tested and the learning rate decays
+    :param lr_decay: Factor of the learning rate per epoch
+    :param gamma: Discount factor (SB3's loop; the fused driver does not discount)
+    :param ent_coef: Entropy coefficient for the loss calculation
+    :param vf_coef: Value function coefficient for the loss calculation (baseline ``critic``)
+    :param max_grad_norm: The maximum value for the gradient clipping
+    :param normalize_advantage: Whether to divide advantages by their standard deviation
+    :param stats_window_size: Window size for the rollout logging
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+        "AllocatorPolicy": AllocatorPolicy,
+        "RouterPolicy": RouterPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        n_steps: int = 512,
+        n_samples: int = 1,
+        baseline: str = "exponential",
+        baseline_kwargs: dict[str, Any] | None = None,
+        instances_per_epoch: int = 1_280_000,
+        lr_decay: float = 1.0,
+        gamma: float = 1.0,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 1.0,
+        normalize_advantage: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,  # type: ignore[arg-type]
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=1.0,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.n_samples = n_samples
+        self.baseline = baseline
+        self.baseline_kwargs = baseline_kwargs or {}
+        self.instances_per_epoch = instances_per_epoch
+        self.lr_decay = lr_decay
+        self.normalize_advantage = normalize_advantage
+        # All that a resumed run needs to go on as if it had not been interrupted.
+        self.stream_seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        self.baseline_state: dict[str, Any] = {}
+        self.baseline_policy: EpisodicPolicy | None = None
+        self.n_batches = 0
+        self.n_instances = 0
+        self.epoch = 0
+        self._n_updates = 0
+        self._max_instances: int | None = None
+        self._batch: EpisodeBatch | None = None
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        for name in ("n_samples", "instances_per_epoch", "n_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.baseline not in BASELINES:
+            raise ValueError(f"baseline is {self.baseline!r}; choose one of {sorted(BASELINES)}.")
+        if self.baseline == "shared" and self.n_samples < 2:
+            raise ValueError("baseline 'shared' is the mean of several samples: set n_samples to at least 2.")
+        n_steps = self.n_steps
+        if issubclass(self.policy_class, EpisodicPolicy):
+            # The fused driver does not use SB3's buffer, so do not fill the memory with one.
+            self.n_steps = 1
+        super()._setup_model()
+        self.n_steps = n_steps
+        try:
+            self._baseline: Baseline = BASELINES[self.baseline](self, **self.baseline_kwargs)
+        except TypeError as error:
+            raise ValueError(
+                f"baseline_kwargs {self.baseline_kwargs} do not fit baseline {self.baseline!r}: {error}"
+            ) from error
+        if self._baseline.needs_episodes and not issubclass(self.policy_class, EpisodicPolicy):
+            self._refuse_baseline()
+        if self.baseline == "rollout":
+            self.baseline_policy = deepcopy(self.policy)  # type: ignore[assignment]
+            self.baseline_policy.requires_grad_(False)  # type: ignore[union-attr]
+            self.baseline_policy.set_training_mode(False)  # type: ignore[union-attr]
+        if self.baseline != "critic" and hasattr(self.policy, "value_net"):
+            # Never trained, and 0 everywhere, so that SB3's bootstrap of time limits adds nothing.
+            for parameter in self.policy.value_net.parameters():
+                th.nn.init.zeros_(parameter)
+
+    def _refuse_baseline(self) -> None:
+        raise ValueError(
+            f"baseline {self.baseline!r} replays instances, which needs a sb3_uav policy on a sb3_uav environment without "
+            "VecEnv wrappers that change rewards or observations; use 'none', 'exponential' or 'critic' here."
+        )
+
+    @property
+    def problem(self) -> Problem | None:
+        """What the fused driver plays; None when policy or environment leave only SB3's step loop."""
+        if not isinstance(self.policy, EpisodicPolicy) or self.env is None:
+            return None
+        return find_problem(self.env)
+
+    def stream(self, stream: int, counter: int) -> np.random.Generator:
+        """
+        :param stream: Which stream of random numbers
+        :param counter: Which part of it
+        :return: A generator that depends on nothing but the seed and these two
+        """
+        return np.random.default_rng([self.stream_seed, stream, counter])
+
+    def draw_batch(self, index: int) -> Instances:
+        """
+        The training instances of one update; the same ones whenever asked.
+
+        :param index: Number of the update, from 0
+        :return: ``n_envs`` instances on the CPU
+        """
+        assert self.problem is not None
+        return self.problem.generator(self.n_envs, self.stream(TRAINING_STREAM, index))
+
+    def action_generator(self, counter: int) -> th.Generator:
+        """
+        :param counter: Number of the update, from 0
+        :return: The source of its sampled actions, on the device of the policy
+        """
+        seed = int(self.stream(ACTION_STREAM, counter).integers(2**63 - 1))
+        return th.Generator(self.device).manual_seed(seed)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        problem = self.problem
+        if problem is not None:
+            return self._collect_episodes(problem, env, callback)
+        if self._baseline.needs_episodes:
+            self._refuse_baseline()
+        if rollout_buffer.buffer_size != n_rollout_steps:
+            rollout_buffer.buffer_size = n_rollout_steps
+        if not super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps):
+            return False
+        self._compute_step_advantages(rollout_buffer)
+        return True
+
+    def _compute_step_advantages(self, rollout_buffer: RolloutBuffer) -> None:
+        """Replace the buffer's advantages by return minus baseline, and by 0 in episodes that have not ended."""
+        if self.baseline != "critic":
+            ended_after = np.vstack([rollout_buffer.episode_starts[1:], self._last_episode_starts]).astype(bool)
+            complete = np.logical_or.accumulate(ended_after[::-1])[::-1]
+        else:
+            # The critic bootstraps what lies behind the end of the buffer.
+            complete = np.ones_like(rollout_buffer.returns, dtype=bool)
+        advantages = np.zeros_like(rollout_buffer.advantages)
+        if complete.any():
+            returns = np.where(complete, rollout_buffer.returns, np.nan)
+            gain = (returns - self._baseline.of_steps(returns, rollout_buffer.values))[complete]
+            if self.normalize_advantage:
+                gain = (gain - gain.mean()) / (gain.std() + 1e-8)
+            # The mean over the buffer becomes the mean over complete episodes.
+            advantages[complete] = gain * (complete.size / complete.sum())
+        rollout_buffer.advantages = advantages
+
+    def _collect_episodes(self, problem: Problem, env: VecEnv, callback: BaseCallback) -> bool:
+        """Play ``n_samples`` complete episodes on each of ``n_envs`` new instances."""
+        assert isinstance(self.policy, EpisodicPolicy)
+        self._batch = None
+        callback.on_rollout_start()
+        if self._max_instances is not None and self.n_instances >= self._max_instances:
+            return False
+        instances = self.draw_batch(self.n_batches).to(self.device)
+        # In training mode and with gradients: this encoding serves the gradient pass too, and batch normalization then acts
+        # and learns with the same statistics.
+        self.policy.set_training_mode(True)
+        cache = self.policy.encode(instances)
+        generator = self.action_generator(self.n_batches)
+        actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
+        with th.no_grad():
+            returns = problem.returns(instances, actions)
+            baseline = self._baseline.of_episodes(problem, instances, returns)
+        lengths = problem.lengths(instances, actions)
+        if not self._report_episodes(env, callback, returns.cpu().numpy(), lengths.cpu().numpy()):
+            return False
+        self._batch = EpisodeBatch(instances, cache, actions, returns, baseline)
+        callback.on_rollout_end()
+        return True
+
+    def _report_episodes(self, env: VecEnv, callback: BaseCallback, returns: np.ndarray, lengths: np.ndarray) -> bool:
+        """
+        Count the steps and call the callbacks as SB3's loop would have: once per ``n_envs`` steps.
+
+        :param returns: ``(n_envs, n_samples)``
+        :param lengths: ``(n_envs, n_samples)``
+        :return: False if a callback wants to stop
+        """
+        batched = env.unwrapped if isinstance(env.unwrapped, BatchedVecEnv) else None
+        for sample in range(self.n_samples):
+            n_calls = math.ceil(lengths[:, sample].sum() / self.n_envs)
+            for call in range(n_calls):
+                last = call == n_calls - 1
+                dones = np.full(self.n_envs, last)
+                rewards = returns[:, sample].astype(np.float32) if last else np.zeros(self.n_envs, dtype=np.float32)
+                infos: list[dict[str, Any]] = [{} for _ in range(self.n_envs)]
+                if last:
+                    for info, episode_return, length in zip(infos, returns[:, sample], lengths[:, sample], strict=True):
+                        info["episode"] = {"r": float(episode_return), "l": int(length)}
+                    if batched is not None:
+                        batched.log_episode(batched.episode_info(returns[0, sample], lengths[0, sample]))
+                self.num_timesteps += self.n_envs
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    return False
+            self._update_info_buffer(infos, dones)
+        return True
+
+    def train(self) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        if self._batch is not None:
+            batch, self._batch = self._batch, None
+            loss = self._episode_loss(batch)
+        else:
+            loss = self._step_loss()
+        self.policy.optimizer.zero_grad()
+        loss.backward()
+        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        self.policy.optimizer.step()
+        self._n_updates += 1
+        self.logger.record("train/loss", loss.item())
+        self.logger.record("train/grad_norm", grad_norm.item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+        problem = self.problem
+        if problem is not None:
+            self.n_batches += 1
+            self.n_instances += self.n_envs
+            self.logger.record("train/epoch", self.epoch)
+            if self.n_instances >= (self.epoch + 1) * self.instances_per_epoch:
+                self._baseline.end_epoch(problem)
+                self.epoch += 1
+
+    def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
+        """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
+        assert isinstance(self.policy, EpisodicPolicy)
+        evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
+        advantages = (batch.returns - batch.baseline).float()[..., None]
+        value_loss = None
+        if self.baseline == "critic":
+            # The value of what is still to come, which for a terminal reward is the return itself.
+            to_go = self._rewards_to_go(batch)
+            value_loss = ((to_go - evaluation.values) ** 2).mean()
+            advantages = to_go - evaluation.values.detach()
+            self.logger.record(
+                "train/explained_variance",
+                float(explained_variance(evaluation.values.detach().flatten().cpu().numpy(), to_go.flatten().cpu().numpy())),
+            )
+        if self.normalize_advantage:
+            advantages = advantages / (advantages.std() + 1e-8)
+        policy_loss = -(advantages * evaluation.log_prob).sum(-1).mean()
+        self.logger.record("train/baseline", batch.baseline.mean().item())
+        return self._total_loss(policy_loss, evaluation.entropy.sum(-1).mean(), value_loss)
+
+    def _rewards_to_go(self, batch: EpisodeBatch) -> th.Tensor:
+        """``(batch, n_samples, n_steps)`` float32: what each step's action and those after it collect."""
+        problem = self.problem
+        assert problem is not None
+        collected = problem.step_rewards(batch.instances, batch.actions, batch.returns)
+        return collected.flip(-1).cumsum(-1).flip(-1).float()
+
+    def _step_loss(self) -> th.Tensor:
+        data = next(self.rollout_buffer.get(batch_size=None))
+        values, log_prob, entropy = self.policy.evaluate_actions(data.observations, data.actions.flatten().long())
+        value_loss = None
+        if self.baseline == "critic":
+            value_loss = ((data.returns - values.flatten()) ** 2).mean()
+        mean_entropy = -log_prob.mean() if entropy is None else entropy.mean()
+        return self._total_loss(-(data.advantages * log_prob).mean(), mean_entropy, value_loss)
+
+    def _total_loss(self, policy_loss: th.Tensor, entropy: th.Tensor, value_loss: th.Tensor | None) -> th.Tensor:
+        self.logger.record("train/policy_gradient_loss", policy_loss.item())
+        self.logger.record("train/entropy_loss", -entropy.item())
+        loss = policy_loss - self.ent_coef * entropy
+        if value_loss is not None:
+            self.logger.record("train/value_loss", value_loss.item())
+            loss = loss + self.vf_coef * value_loss
+        return loss
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            for group in optimizer.param_groups:
+                group["lr"] *= self.lr_decay**self.epoch
+            self.logger.record("train/learning_rate", optimizer.param_groups[0]["lr"])
+
+    def learn(
+        self: SelfREINFORCE,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "REINFORCE",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfREINFORCE:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def learn_instances(
+        self: SelfREINFORCE,
+        n_instances: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "REINFORCE",
+        progress_bar: bool = False,
+    ) -> SelfREINFORCE:
+        """
+        Go on learning for a number of instances, whatever the number of steps they take (fused driver only).
+
+        :param n_instances: How many more instances to learn from, rounded up to whole batches
+        :param callback: callback(s) called at every step
+        :param log_interval: Log the training every ``log_interval`` updates
+        :param tb_log_name: the name of the run for TensorBoard logging
+        :param progress_bar: Display a progress bar
+        :return: the trained model
+        :raises ValueError: If policy and environment leave only SB3's step loop
+        """
+        if self.problem is None:
+            raise ValueError("learn_instances needs a sb3_uav policy on a sb3_uav environment; use learn here.")
+        self._max_instances = self.n_instances + n_instances
+        try:
+            limit = NO_STEP_LIMIT - self.num_timesteps
+            return self.learn(limit, callback, log_interval, tb_log_name, False, progress_bar)
+        finally:
+            self._max_instances = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_baseline", "baseline_policy", "_batch"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        if self.baseline == "rollout":
+            state_dicts = [*state_dicts, "baseline_policy"]
+        return state_dicts, variables
+
+
+def find_problem(env: VecEnv) -> Problem | None:
+    """
+    :param env: The environment of an algorithm
+    :return: The problem behind it; None if it is not one of ours, or wrapped in something that changes what it does
+    """
+    while isinstance(env, VecMonitor):
+        env = env.venv
+    if isinstance(env, BatchedVecEnv):
+        return env.problem
+    if isinstance(env, DummyVecEnv):
+        problem_env = unwrap_problem_env(env.envs[0])
+        return None if problem_env is None else problem_env.problem
+    return None
