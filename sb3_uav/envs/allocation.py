@@ -195,11 +195,12 @@ class AllocationProblem(Problem):
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
         rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
-        last = (self.lengths(instances, actions) - 1).clamp(min=0)
+        last = self.lengths(instances, actions) - 1
         return rewards.scatter(-1, last[..., None], returns[..., None])
 
     def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        return instances.task_mask.sum(1)[:, None].expand(actions.shape[:2])
+        # An instance without tasks is over only after a first step, which finds nothing to do.
+        return instances.task_mask.sum(1).clamp(min=1)[:, None].expand(actions.shape[:2])
 
     def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
         # Until the end there are no tours: draw the tasks of each UAV in the order in which it got them.

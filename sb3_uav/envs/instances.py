@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,9 @@ import torch as th
 
 # One tolerance for the dynamics and for the checker, relative to the maximum flight distance.
 DISTANCE_TOLERANCE = 1e-9
+
+# What numpy and zipfile raise on damaged files: the last on headers that ask for encryption or an unknown compression.
+UNREADABLE = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,42 +82,37 @@ class Instances:
         :return: The instances, float64 on the CPU
         :raises ValueError: If a shape or a value is not allowed; the message names the field and what was found
         """
-        try:
-            tasks = np.array(tasks, dtype=np.float64)
-            depot = np.array(depot, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{source}: depot and tasks must be arrays of numbers: {error}") from error
+        tasks, depot = _as_numbers("tasks", tasks, source), _as_numbers("depot", depot, source)
+        values = None if values is None else _as_numbers("values", values, source)
+        task_mask = None if task_mask is None else _as_numbers("task_mask", task_mask, source)
         if tasks.ndim == 2 and depot.ndim == 1:
             tasks, depot = tasks[None], depot[None]
-            values = None if values is None else np.asarray(values)[None]
-            task_mask = None if task_mask is None else np.asarray(task_mask)[None]
+            values = None if values is None else values[None]
+            task_mask = None if task_mask is None else task_mask[None]
         if tasks.ndim != 3 or tasks.shape[-1] != 2:
             raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}, expected (batch, n_tasks, 2).")
         batch_size, n_tasks = tasks.shape[:2]
         if batch_size < 1 or n_tasks < 1:
             raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}; give at least one instance with one task.")
-        uavs = np.unique(np.asarray(n_uavs))
+        if task_mask is not None and not np.isin(task_mask, (0, 1)).all():
+            raise ValueError(f"{source}: field 'task_mask' holds other things than True and False.")
+        uavs = np.unique(_per_instance("n_uavs", n_uavs, batch_size, source))
         if len(uavs) != 1:
-            raise ValueError(f"{source}: field 'n_uavs' mixes {uavs.tolist()}; store each fleet size in a file of its own.")
+            found = ", ".join(f"{n:g}" for n in uavs)
+            raise ValueError(f"{source}: field 'n_uavs' mixes {found}; store each fleet size in a file of its own.")
         if not float(uavs[0]).is_integer() or uavs[0] < 1:
-            raise ValueError(f"{source}: field 'n_uavs' is {uavs[0]}, but a fleet has a whole number of UAVs, at least 1.")
-        try:
-            distance = np.broadcast_to(np.asarray(max_distance, dtype=np.float64), (batch_size,))
-        except ValueError as error:
-            found = np.shape(max_distance)
-            raise ValueError(f"{source}: field 'max_distance' has shape {found}, expected ({batch_size},).") from error
+            raise ValueError(f"{source}: field 'n_uavs' is {uavs[0]:g}, but a fleet has a whole number of UAVs, at least 1.")
+        distance = _per_instance("max_distance", max_distance, batch_size, source)
         try:
             instances = cls(
                 depot=th.from_numpy(depot),
                 tasks=th.from_numpy(tasks),
-                values=th.ones(batch_size, n_tasks, dtype=th.float64)
-                if values is None
-                else th.from_numpy(np.array(values, dtype=np.float64)),
-                max_distance=th.from_numpy(distance.copy()),
+                values=th.ones(batch_size, n_tasks, dtype=th.float64) if values is None else th.from_numpy(values),
+                max_distance=th.from_numpy(distance),
                 n_uavs=int(uavs[0]),
                 task_mask=th.ones(batch_size, n_tasks, dtype=th.bool)
                 if task_mask is None
-                else th.from_numpy(np.array(task_mask, dtype=bool)),
+                else th.from_numpy(task_mask.astype(bool)),
             )
             instances.validate()
         except ValueError as error:
@@ -124,19 +123,27 @@ class Instances:
         """
         Check the contents.
 
-        :raises ValueError: On NaN or infinite numbers, a negative value, ``max_distance <= 0``, fewer than one UAV, or padding
-            that is not at the end of its row; the message names the field, the row and the value found
+        :raises ValueError: On NaN or infinite numbers, a negative value, ``max_distance <= 0``, fewer than one UAV, padding
+            that is not at the end of its row, or another dtype than float64; the message names the field, the row and the
+            value found
         """
+        if self.task_mask.dtype != th.bool:
+            raise ValueError(f"field 'task_mask' has dtype {self.task_mask.dtype}; it must be bool.")
         for name in ("depot", "tasks", "values", "max_distance"):
             field = getattr(self, name)
-            bad = ~th.isfinite(field)
+            if field.dtype != th.float64:
+                raise ValueError(f"field '{name}' has dtype {field.dtype}; feasibility is decided in float64.")
+            # In float32, because observations are: 1e39 would reach a network as inf.
+            bad = ~th.isfinite(field.float())
             if bad.any():
                 where = tuple(int(i) for i in bad.nonzero()[0])
-                raise ValueError(f"field '{name}' holds {field[where].item()} at index {where}; every number must be finite.")
+                found = field[where].item()
+                raise ValueError(f"field '{name}' holds {found} at index {where}; every number must be finite in float32.")
         if self.n_uavs < 1:
             raise ValueError(f"field 'n_uavs' is {self.n_uavs}, but a fleet needs at least 1 UAV.")
-        if (self.max_distance <= 0).any():
-            row = int((self.max_distance <= 0).nonzero()[0, 0])
+        too_short = self.max_distance.float() <= 0
+        if too_short.any():
+            row = int(too_short.nonzero()[0, 0])
             found = self.max_distance[row].item()
             raise ValueError(f"field 'max_distance' is {found} in instance {row}; the maximum flight distance must be > 0.")
         if (self.values < 0).any():
@@ -162,9 +169,13 @@ class Instances:
         return self.batch_size
 
     def __getitem__(self, rows: int | slice | th.Tensor | np.ndarray | Sequence[int]) -> Instances:
-        """Select rows; an ``int`` gives a batch of one."""
-        if isinstance(rows, int):
-            rows = slice(rows, rows + 1) if rows != -1 else slice(rows, None)
+        """Select rows; an ``int`` gives a batch of one, and one that is out of range an ``IndexError``."""
+        if isinstance(rows, int | np.integer):
+            if not -len(self) <= rows < len(self):
+                # This also ends iteration, which Python builds from __getitem__.
+                raise IndexError(f"instance {rows} of a batch of {len(self)}")
+            row = int(rows) % len(self)
+            rows = slice(row, row + 1)
         index: Any = th.as_tensor(rows, device=self.device) if not isinstance(rows, slice | th.Tensor) else rows
         return replace(
             self,
@@ -247,7 +258,7 @@ class Instances:
         path = Path(path)
         path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
         temporary = path.with_name(path.name + ".tmp.npz")
-        arrays = {name: getattr(self, name).cpu().numpy() for name in ("depot", "tasks", "values", "max_distance")}
+        arrays = {name: getattr(self, name).double().cpu().numpy() for name in ("depot", "tasks", "values", "max_distance")}
         arrays["n_uavs"] = np.full(self.batch_size, self.n_uavs)
         if not self.task_mask.all():
             arrays["task_mask"] = self.task_mask.cpu().numpy()
@@ -260,7 +271,7 @@ class Instances:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Instances:
         """
-        Read an ``.npz`` file with arrays ``depot``, ``tasks``, and optionally ``values``, ``max_distance``, ``n_uavs`` and
+        Read an ``.npz`` file with arrays ``depot``, ``tasks``, ``max_distance``, ``n_uavs``, and optionally ``values`` and
         ``task_mask``.
 
         :param path: The file
@@ -272,15 +283,35 @@ class Instances:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # Not np.load(path), which would also read a .npy or offer to unpickle whatever else it finds.
+            with path.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
-        except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); write it again.") from error
         missing = {"depot", "tasks", "max_distance", "n_uavs"} - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")
         known = {"depot", "tasks", "values", "max_distance", "n_uavs", "task_mask"}
         return cls.from_arrays(**{name: arrays[name] for name in known if name in arrays}, source=str(path))
+
+
+def _as_numbers(name: str, array: Any, source: str) -> np.ndarray:
+    """A float64 copy of anything that holds real numbers; the error names the field."""
+    try:
+        found = np.asarray(array)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{source}: field '{name}' must be an array of real numbers: {error}") from error
+    if found.dtype.kind not in "biuf":
+        raise ValueError(f"{source}: field '{name}' must be an array of real numbers, found {array!r:.80}.")
+    return found.astype(np.float64)
+
+
+def _per_instance(name: str, array: Any, batch_size: int, source: str) -> np.ndarray:
+    """``(batch_size,)`` float64, from as many numbers or from one for all."""
+    numbers = _as_numbers(name, array, source)
+    if numbers.shape not in ((), (1,), (batch_size,)):
+        raise ValueError(f"{source}: field '{name}' has shape {numbers.shape}, expected ({batch_size},).")
+    return np.broadcast_to(numbers, (batch_size,)).copy()
 
 
 def euclidean(a: th.Tensor, b: th.Tensor) -> th.Tensor:
@@ -304,7 +335,7 @@ def distance_limit(max_distance: th.Tensor) -> th.Tensor:
     :param max_distance: ``(batch,)``
     :return: ``(batch,)``
     """
-    return max_distance + DISTANCE_TOLERANCE * max_distance.clamp(min=1.0)
+    return max_distance + DISTANCE_TOLERANCE * max_distance
 
 
 class InstanceGenerator(Protocol):

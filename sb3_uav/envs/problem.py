@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Protocol, TypeVar
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 
 from sb3_uav.envs.instances import InstanceGenerator, Instances
@@ -71,6 +73,8 @@ class Problem(ABC):
 
     observation_space: spaces.Dict
     action_space: spaces.Discrete
+    # Whether the number of UAVs of an instance matters.
+    uses_fleet: ClassVar[bool] = True
 
     def __init__(self, generator: InstanceGenerator) -> None:
         self.generator = generator
@@ -207,8 +211,8 @@ class Episodes:
         """
         given = given or {}
         indices = np.arange(self.n_envs) if rows is None else np.asarray(rows)
-        fresh = Instances.concatenate([given.get(int(i)) or self.problem.generator(1, self.rngs[i]) for i in indices])
-        fresh = self._fit(fresh)
+        drawn = [self._fit(given.get(int(i)) or self.problem.generator(1, self.rngs[i])) for i in indices]
+        fresh = Instances.concatenate(drawn)
         if self.state is None or len(indices) == self.n_envs:
             self.instances = fresh
         else:
@@ -235,27 +239,38 @@ class Episodes:
         self._static_observation = {key: value.numpy() for key, value in static.items()}
 
     def _fit(self, instances: Instances) -> Instances:
-        """Pad to the size of the observation space."""
-        n_tasks = self.problem.generator.n_tasks
+        """Pad to the size of the observation space, and refuse what does not fit."""
+        n_tasks, n_uavs = self.problem.generator.n_tasks, self.problem.generator.n_uavs
+        if self.problem.uses_fleet and instances.n_uavs != n_uavs:
+            raise ValueError(
+                f"The instance has {instances.n_uavs} UAVs, but the environment was made for {n_uavs}; "
+                f"make the environment with n_uavs={instances.n_uavs}."
+            )
         if instances.n_tasks > n_tasks:
             raise ValueError(
                 f"The instance has {instances.n_tasks} tasks, but the observation space holds {n_tasks}; "
                 "make the environment with a larger n_tasks."
             )
-        return instances.pad(n_tasks)
+        return replace(instances.pad(n_tasks), n_uavs=n_uavs)
 
     def step(self, actions: np.ndarray) -> StepResult:
         """
         :param actions: ``(n_envs,)`` integers
         :return: What follows; finished rows are not reset here
         """
-        chosen = th.as_tensor(np.asarray(actions), dtype=th.int64).reshape(self.n_envs, 1)
+        if self.state is None:
+            raise ResetNeeded("There is no episode to step yet; call reset() first.")
+        given = np.asarray(actions)
         n_actions = self.state.action_mask.shape[-1]
-        if ((chosen < 0) | (chosen >= n_actions)).any():
-            raise ValueError(f"Actions must lie between 0 and {n_actions - 1}, found {chosen.flatten().tolist()}.")
+        if given.size != self.n_envs or not np.isin(given, np.arange(n_actions)).all():
+            raise ValueError(
+                f"Give {self.n_envs} whole numbers between 0 and {n_actions - 1} as actions; found {given.tolist()!r:.80}."
+            )
+        chosen = th.from_numpy(given.astype(np.int64)).reshape(self.n_envs, 1)
         illegal = ~self.state.action_mask.gather(-1, chosen[..., None]).reshape(self.n_envs)
-        for row, (action, wrong) in enumerate(zip(chosen[:, 0].tolist(), illegal.tolist(), strict=True)):
-            if not wrong:
+        effective = ~illegal & ~self.state.done.reshape(self.n_envs)
+        for row, (action, has_effect) in enumerate(zip(chosen[:, 0].tolist(), effective.tolist(), strict=True)):
+            if has_effect:
                 self._actions[row].append(action)
         self.state, rewards = self.dynamics.step(self.state, chosen)
         return StepResult(
@@ -268,7 +283,7 @@ class Episodes:
     def observation(self) -> dict[str, np.ndarray]:
         """The observation of every row, ``(n_envs, ...)``, in the dtype of the observation space."""
         dynamic = self.problem.observe(self.dynamics, self.state)
-        observation = dict(self._static_observation)
+        observation = {key: value.copy() for key, value in self._static_observation.items()}
         for key, value in dynamic.items():
             observation[key] = value.numpy().astype(self.problem.observation_space[key].dtype)
         return {key: observation[key] for key in self.problem.observation_space.spaces}
@@ -279,7 +294,7 @@ class Episodes:
 
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""
-        return self.state.action_mask[:, 0].numpy()
+        return self.state.action_mask[:, 0].numpy().copy()
 
 
 def given_instance(options: dict[str, Any] | None) -> Instances | None:

@@ -76,6 +76,7 @@ class MapFigure:
             if matplotlib.get_backend().lower() in {"agg", "pdf", "svg", "ps", "cairo", "template"}:
                 logger.warning("No display was found, so render_mode='human' shows nothing; use render_mode='rgb_array'.")
                 self.interactive = False
+        if self.interactive:
             self.figure = plt.figure(figsize=(5, 5.6))
         else:
             self.figure = matplotlib.figure.Figure(figsize=(5, 5.6), dpi=100)

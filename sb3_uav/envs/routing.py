@@ -119,6 +119,8 @@ def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
 class RoutingProblem(Problem):
     """Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited."""
 
+    uses_fleet = False
+
     def _action_space(self) -> spaces.Discrete:
         return spaces.Discrete(self.generator.n_tasks + 1)
 

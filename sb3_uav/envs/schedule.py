@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,9 +80,9 @@ def check_schedule(instances: Instances, row: int, schedule: Schedule) -> Schedu
             seen[task] = uav
         stops = [depot, *(tasks[task] for task in route), depot]
         length = 0.0
-        for a, b in zip(stops, stops[1:], strict=False):
+        for a, b in itertools.pairwise(stops):
             length += math.hypot(a[0] - b[0], a[1] - b[1])
-        if not length <= max_distance + DISTANCE_TOLERANCE * max(max_distance, 1.0):
+        if not length <= max_distance + DISTANCE_TOLERANCE * max_distance:
             raise InfeasibleScheduleError(
                 f"UAV {uav} flies {length:.9f}, which is {length - max_distance:.3g} over its maximum of {max_distance:.9f}."
             )
@@ -116,7 +117,7 @@ def schedule_from_json(record: Any, source: str) -> tuple[str, int, Schedule]:
     if not isinstance(record, dict) or not {"solver", "instance", "routes"} <= set(record):
         raise ValueError(f"{source}: a schedule needs the fields 'solver', 'instance' and 'routes', found {record!r:.80}.")
     routes = record["routes"]
-    whole = isinstance(routes, Sequence) and all(
+    whole = isinstance(routes, list) and all(
         isinstance(route, list) and all(type(task) is int for task in route) for route in routes
     )
     if not whole or type(record["instance"]) is not int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -25,9 +26,13 @@ def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper around it changes what it does
     """
     inner: Any = env
-    while isinstance(inner, TRANSPARENT_WRAPPERS):
+    # Exact types and ProblemEnv's own methods only: a subclass may do something else.
+    while type(inner) in TRANSPARENT_WRAPPERS:
         inner = inner.env
-    return inner if isinstance(inner, ProblemEnv) else None
+    if not isinstance(inner, ProblemEnv):
+        return None
+    inherits = type(inner).step is ProblemEnv.step and type(inner).reset is ProblemEnv.reset
+    return inner if inherits else None
 
 
 class BatchedVecEnv(VecEnv):
@@ -50,6 +55,8 @@ class BatchedVecEnv(VecEnv):
         self.template = problem_env
         self.problem: Problem = problem_env.problem
         self._monitor = env if isinstance(env, Monitor) else None
+        self._info_keywords: tuple[str, ...] = () if self._monitor is None else self._monitor.info_keywords
+        self._windows: dict[int, Any] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
         self._start_time = time.time()
         self._actions = np.zeros(len(env_fns), dtype=np.int64)
@@ -91,6 +98,8 @@ class BatchedVecEnv(VecEnv):
                 infos[row]["TimeLimit.truncated"] = False
                 infos[row]["objective"] = float(self._episode_returns[row])
                 infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
+                for key in self._info_keywords:
+                    infos[row]["episode"][key] = infos[row][key]
             if 0 in finished:
                 self.log_episode(infos[0]["episode"])
             for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
@@ -109,6 +118,13 @@ class BatchedVecEnv(VecEnv):
         if self._monitor is not None and self._monitor.results_writer is not None:
             self._monitor.results_writer.write_row(episode_info)
 
+    @property
+    def monitor_folder(self) -> str | None:
+        """Where the monitor file lies, if there is one."""
+        if self._monitor is None or self._monitor.results_writer is None:
+            return None
+        return os.path.dirname(self._monitor.results_writer.file_handler.name)
+
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""
         return self.episodes.action_masks()
@@ -121,6 +137,9 @@ class BatchedVecEnv(VecEnv):
         if self._monitor is not None:
             self._monitor.close()
         self.template.close()
+        for window in self._windows.values():
+            window.close()
+        self._windows.clear()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         if self.render_mode != "rgb_array":
@@ -137,12 +156,21 @@ class BatchedVecEnv(VecEnv):
             images.append(figure.rgb_array())
         return images
 
-    def has_attr(self, attr_name: str) -> bool:
-        return hasattr(self.template, attr_name)
+    def _show(self, rows: Iterable[int]) -> None:
+        from sb3_uav.envs.render import MapFigure
+
+        for row in rows:
+            if row not in self._windows:
+                self._windows[row] = MapFigure(interactive=True)
+            self._windows[row].draw(self.episodes.instances, row, self.episodes.routes(row))
+            self._windows[row].show()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the one shared environment, once per row."""
-        return [getattr(self.template, attr_name) for _ in self._get_indices(indices)]
+        """The attribute of the one shared environment, once per row; ``instance`` differs from row to row."""
+        rows = self._get_indices(indices)
+        if attr_name == "instance":
+            return [self.episodes.instances[row] for row in rows]
+        return [getattr(self.template, attr_name) for _ in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
@@ -165,15 +193,20 @@ class BatchedVecEnv(VecEnv):
         if method_name == "action_masks":
             masks = self.action_masks()
             return [masks[row] for row in rows]
+        if method_name == "render" and self.render_mode == "human":
+            self._show(rows)
+            return [None for _ in rows]
         if method_name == "render":
             return list(self._images(rows))
+        if method_name in ("reset", "step"):
+            raise ValueError(f"The rows of a BatchedVecEnv share one environment; call its own {method_name}() instead.")
         self._require_all_rows(indices, f"call {method_name}")
         result = getattr(self.template, method_name)(*method_args, **method_kwargs)
         return [result for _ in rows]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """True for ``Monitor``, whose statistics this class provides; other wrappers are refused in the constructor."""
-        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
+        return [issubclass(Monitor, wrapper_class) for _ in self._get_indices(indices)]
 
     def _require_all_rows(self, indices: VecEnvIndices, action: str) -> None:
         if set(self._get_indices(indices)) != set(range(self.num_envs)):

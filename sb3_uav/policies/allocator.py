@@ -37,7 +37,7 @@ class AllocatorExtractor(EpisodicExtractor):
     :param n_layers: Number of attention layers
     :param n_heads: Number of heads
     :param ff_dim: Hidden size of the feed-forward layers
-    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param use_values: Whether task values are features of the encoder
     """
 
@@ -48,7 +48,7 @@ class AllocatorExtractor(EpisodicExtractor):
         n_layers: int = 3,
         n_heads: int = 8,
         ff_dim: int = 512,
-        normalization: str = "layer",
+        normalization: str = "instance",
         use_values: bool = True,
     ) -> None:
         super().__init__(

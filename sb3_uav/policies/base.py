@@ -27,7 +27,7 @@ from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
 
 # The settings of the encoder, by preset; arguments of the policy override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
-    "default": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="layer", use_values=True),
+    "default": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="instance", use_values=True),
     # Section IV-A2 of the paper and DESIGN section 5.
     "paper": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch", use_values=False),
 }
@@ -204,7 +204,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param n_layers: Number of attention layers
     :param n_heads: Number of heads
     :param ff_dim: Hidden size of the feed-forward sublayers
-    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param use_values: Whether task values are features of the encoder
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
     :param activation_fn: Activation function of ``net_arch``

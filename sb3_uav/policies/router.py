@@ -42,7 +42,7 @@ class RouterExtractor(EpisodicExtractor):
     :param n_layers: Number of attention layers
     :param n_heads: Number of heads
     :param ff_dim: Hidden size of the feed-forward sublayers
-    :param normalization: ``"batch"``, ``"layer"`` or ``"none"``
+    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param use_values: Whether task values are features of the encoder
     """
 
@@ -53,7 +53,7 @@ class RouterExtractor(EpisodicExtractor):
         n_layers: int = 3,
         n_heads: int = 8,
         ff_dim: int = 512,
-        normalization: str = "layer",
+        normalization: str = "instance",
         use_values: bool = True,
     ) -> None:
         assert isinstance(observation_space, spaces.Dict)

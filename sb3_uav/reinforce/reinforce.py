@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
+import pathlib
+from collections.abc import Iterable
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -27,6 +30,7 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
 from sb3_uav.reinforce.baselines import ACTION_STREAM, BASELINES, TRAINING_STREAM, Baseline
+from sb3_uav.reinforce.saving import save_atomically
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -151,7 +155,8 @@ class REINFORCE(OnPolicyAlgorithm):
         self.n_instances = 0
         self.epoch = 0
         self._n_updates = 0
-        self._max_instances: int | None = None
+        # Collecting stops there; set by learn_instances and by the ITS callback.
+        self.max_instances: int | None = None
         self._batch: EpisodeBatch | None = None
 
         if _init_setup_model:
@@ -265,7 +270,7 @@ class REINFORCE(OnPolicyAlgorithm):
         assert isinstance(self.policy, EpisodicPolicy)
         self._batch = None
         callback.on_rollout_start()
-        if self._max_instances is not None and self.n_instances >= self._max_instances:
+        if self.max_instances is not None and self.n_instances >= self.max_instances:
             return False
         instances = self.draw_batch(self.n_batches).to(self.device)
         # In training mode and with gradients: this encoding serves the gradient pass too, and batch normalization then acts
@@ -423,15 +428,23 @@ class REINFORCE(OnPolicyAlgorithm):
         """
         if self.problem is None:
             raise ValueError("learn_instances needs a sb3_uav policy on a sb3_uav environment; use learn here.")
-        self._max_instances = self.n_instances + n_instances
+        self.max_instances = self.n_instances + n_instances
         try:
             limit = NO_STEP_LIMIT - self.num_timesteps
             return self.learn(limit, callback, log_interval, tb_log_name, False, progress_bar)
         finally:
-            self._max_instances = None
+            self.max_instances = None
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        save_atomically(self, path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_baseline", "baseline_policy", "_batch"]
+        return [*super()._excluded_save_params(), "_baseline", "baseline_policy", "_batch", "max_instances"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -1,0 +1,58 @@
+# `make help` lists the targets. `make PYTHON=python3.12 install` chooses the interpreter, `make test PYTEST_ARGS="-k name"`
+# the tests.
+PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python3)
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+LINT_PATHS := sb3_uav tests benchmarks
+BENCHMARKS := $(filter-out benchmarks/_%,$(sort $(wildcard benchmarks/*.py)))
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: install demo test test-fast lint format check-codestyle type commit-checks bench clean help
+
+install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
+
+# torch comes first and alone: without its pin pip may fetch several gigabytes of another build.
+$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -c constraints.txt torch
+	$(BIN)/python -m pip install -c constraints.txt -e ".[all,dev]"
+	touch $@
+
+demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)
+	$(BIN)/python -m sb3_uav.zoo.demo --out demo
+
+test: $(INSTALLED)  ## Run the whole test suite
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-fast: $(INSTALLED)  ## Run the tests without the slow ones
+	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+lint: $(INSTALLED)  ## Look for mistakes with ruff
+	$(BIN)/ruff check $(LINT_PATHS)
+
+format: $(INSTALLED)  ## Sort the imports and format the code
+	$(BIN)/ruff check --select I --fix $(LINT_PATHS)
+	$(BIN)/ruff format $(LINT_PATHS)
+
+check-codestyle: $(INSTALLED)  ## Fail if `make format` would change anything
+	$(BIN)/ruff check --select I $(LINT_PATHS)
+	$(BIN)/ruff format --check $(LINT_PATHS)
+
+type: $(INSTALLED)  ## Check the types with mypy
+	$(BIN)/mypy $(LINT_PATHS)
+
+commit-checks: format lint type  ## What to run before a commit
+
+bench: $(INSTALLED)  ## Run every benchmark
+	@set -e; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script; done
+
+clean:  ## Remove caches, builds and the demo's files (not .venv, not logs)
+	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find sb3_uav tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:  ## Show this list
+	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

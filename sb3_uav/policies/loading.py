@@ -1,0 +1,155 @@
+"""Reading a policy back from an SB3 zip without executing anything that the file contains."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+import torch as th
+from stable_baselines3.common.utils import get_device
+
+from sb3_uav.policies.allocator import AllocatorPolicy
+from sb3_uav.policies.base import EpisodicPolicy
+from sb3_uav.policies.router import RouterPolicy
+
+PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
+
+# A parameter that only one of the policies has.
+SIGNATURES: dict[str, type[EpisodicPolicy]] = {
+    "features_extractor.project_context.weight": AllocatorPolicy,
+    "features_extractor.project_graph.weight": RouterPolicy,
+}
+# Stock A2C puts its optimizer class, which JSON cannot hold, into policy_kwargs; acting needs no optimizer.
+IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
+
+
+@overload
+def load_policy(path: str | os.PathLike[str], device: th.device | str = "auto", expected: None = None) -> EpisodicPolicy: ...
+@overload
+def load_policy(path: str | os.PathLike[str], device: th.device | str, expected: type[PolicyT]) -> PolicyT: ...
+@overload
+def load_policy(path: str | os.PathLike[str], device: th.device | str = "auto", *, expected: type[PolicyT]) -> PolicyT: ...
+
+
+def load_policy(
+    path: str | os.PathLike[str], device: th.device | str = "auto", expected: type[EpisodicPolicy] | None = None
+) -> EpisodicPolicy:
+    """
+    Load the allocator or the router from the zip of any SB3 algorithm (REINFORCE, PPO, A2C, MaskablePPO).
+
+    Unlike the algorithm's own ``load``, this unpickles nothing, so that a zip from a stranger is safe to open: it reads the
+    plain JSON of the zip, and its tensors with ``weights_only=True``.
+
+    :param path: The zip; ``.zip`` is appended if there is no such file, as SB3 does
+    :param device: Device on which the policy should run
+    :param expected: The class that it must be; any of ours when None
+    :return: The policy, in evaluation mode
+    :raises FileNotFoundError: If there is no such file
+    :raises ValueError: If the file is damaged, is not the zip of one of our policies or of another one than expected, or
+        holds numbers that are not finite; the message names the file and what to do
+    """
+    file = _existing_file(Path(path))
+    data, parameters = _read_zip(file)
+    policy_class = next((cls for key, cls in SIGNATURES.items() if key in parameters), None)
+    if policy_class is None:
+        raise ValueError(
+            f"{file}: holds the policy of another kind (its first parameter is {next(iter(parameters), 'missing')!r}); "
+            "give a zip that was trained with AllocatorPolicy or RouterPolicy."
+        )
+    if expected is not None and not issubclass(policy_class, expected):
+        raise ValueError(
+            f"{file}: holds the policy of class {policy_class.__name__}, but {expected.__name__} is needed here; "
+            "have the allocator's and the router's zip been exchanged?"
+        )
+    for name, parameter in parameters.items():
+        if not th.isfinite(parameter).all():
+            found = parameter[~th.isfinite(parameter)].flatten()[0].item()
+            raise ValueError(f"{file}: parameter '{name}' holds {found}; the training diverged, use an earlier checkpoint.")
+    policy_kwargs = _plain_policy_kwargs(data, file)
+    try:
+        policy = policy_class.from_parameters(parameters, policy_kwargs, "cpu")
+    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{file}: parameters and policy_kwargs {policy_kwargs} do not fit together ({reason:.300}); "
+            "the zip was edited, or was written by another version of sb3_uav."
+        ) from error
+    try:
+        return policy.to(get_device(device))
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device is {str(device)!r}, which cannot be used ({reason}); try 'cpu' or 'auto'.") from error
+
+
+def _existing_file(path: Path) -> Path:
+    """
+    :param path: What the user gave
+    :return: The file that is meant
+    :raises FileNotFoundError: If there is none
+    """
+    for candidate in (path, path.with_name(path.name + ".zip")):
+        if candidate.is_file():
+            return candidate
+    raise FileNotFoundError(f"{path}: no such file; give the path of a zip that was saved by an SB3 algorithm.")
+
+
+def _read_zip(file: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    """
+    :param file: An SB3 zip
+    :return: The attributes of the algorithm as they stand in its JSON, and the state dict of its policy on the CPU
+    :raises ValueError: If it is not one
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            missing = {"data", "policy.pth"} - set(archive.namelist())
+            if missing:
+                raise ValueError(
+                    f"{file}: is not the zip of an SB3 algorithm ({sorted(missing)} missing in it); "
+                    "give a zip that was written by model.save()."
+                )
+            text, tensors = archive.read("data"), archive.read("policy.pth")
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(
+            f"{file}: is not an intact zip ({error}); it is damaged or incomplete, save or copy it again."
+        ) from error
+    try:
+        data = json.loads(text)
+        parameters = th.load(io.BytesIO(tensors), map_location="cpu", weights_only=True)
+    except (ValueError, RuntimeError, EOFError, LookupError, TypeError, AttributeError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(
+            f"{file}: 'data' or 'policy.pth' in it cannot be read safely ({reason:.200}); save it again."
+        ) from error
+    whole = isinstance(parameters, dict) and all(isinstance(value, th.Tensor) for value in parameters.values())
+    if not whole or not isinstance(data, dict):
+        raise ValueError(f"{file}: 'policy.pth' must hold named tensors and 'data' an object; save it again with SB3.")
+    return data, parameters
+
+
+def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
+    """
+    :param data: The JSON of an SB3 zip
+    :param file: Where it stands, named in errors
+    :return: ``policy_kwargs`` without those for the optimizer
+    :raises ValueError: If some of them were not plain data, and so stand there as a pickle
+    """
+    stored = data.get("policy_kwargs", {})
+    if not isinstance(stored, dict):
+        raise ValueError(f"{file}: 'policy_kwargs' is {stored!r:.80}, expected a dictionary; save it again with SB3.")
+    policy_kwargs = {key: value for key, value in stored.items() if key not in IGNORED_KWARGS}
+    if ":serialized:" in stored:
+        # Beside the pickle of a dictionary, SB3 writes its plain items as they are and the others as their repr.
+        pickled = sorted(key for key, value in policy_kwargs.items() if isinstance(value, str) and "<" in value)
+        if pickled or "dict" not in str(stored.get(":type:")):
+            raise ValueError(
+                f"{file}: policy_kwargs {pickled or stored.get(':type:')} are Python objects, stored as a pickle, which is "
+                "not executed here; train with plain numbers, strings and lists in policy_kwargs, or, if you trust the file, "
+                "load it with the algorithm's own load() and use model.policy."
+            )
+    return policy_kwargs

@@ -1,0 +1,15 @@
+from sb3_uav.solvers.base import SOLVERS, OneByOneSolver, Solver, SolverResult, make_solver
+from sb3_uav.solvers.dl_drl import DLDRL
+from sb3_uav.solvers.evaluation import SummaryRow, evaluate, print_table
+
+__all__ = [
+    "DLDRL",
+    "SOLVERS",
+    "OneByOneSolver",
+    "Solver",
+    "SolverResult",
+    "SummaryRow",
+    "evaluate",
+    "make_solver",
+    "print_table",
+]

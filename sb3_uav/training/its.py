@@ -1,0 +1,546 @@
+"""The interactive training strategy (paper, section IV-C and Algorithm 1) as a callback on the allocator's training."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EventCallback,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_uav.envs.allocation import AllocationProblem
+from sb3_uav.envs.routing import RoutePlanningEnv
+from sb3_uav.envs.vec_env import BatchedVecEnv
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.reinforce import NO_STEP_LIMIT, find_problem
+from sb3_uav.reinforce.saving import save_atomically
+from sb3_uav.training.freezing import Freezer
+from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
+
+ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
+    "reinforce": REINFORCE,
+    "ppo": PPO,
+    "ppo_mask": MaskablePPO,  # type: ignore[dict-item]
+    "a2c": A2C,
+}
+# The paper's names (Fig. 5); "independent" is DL-DRL-I.
+STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive", "independent")
+# A stream of random numbers of its own, disjoint from those of REINFORCE.
+SUBSET_STREAM = 10
+
+CHECKPOINT_FOLDER = "its_checkpoint"
+STATE_FILE = "its_state.json"
+LOG_FILE = "its_log.csv"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """
+    One finished epoch of one level.
+
+    :param epoch: Number of the epoch of this level, from 1
+    :param level: ``"allocator"`` or ``"router"``
+    :param phase: ``"pre-training"``, ``"intensive"`` or ``"alternate"``; of the allocator, that of the router's next block
+    :param n_instances: Instances trained on in this epoch
+    :param objective: Mean return of its training episodes
+    :param seconds: Wall time
+    """
+
+    epoch: int
+    level: str
+    phase: str
+    n_instances: int
+    objective: float
+    seconds: float
+
+
+class EpisodeStatistics(BaseCallback):
+    """Mean return of the episodes since the last :meth:`reset_statistics`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reset_statistics()
+
+    def reset_statistics(self) -> None:
+        self.n_episodes, self.total_return = 0, 0.0
+
+    @property
+    def mean_return(self) -> float:
+        return self.total_return / self.n_episodes if self.n_episodes > 0 else float("nan")
+
+    def count(self, variables: dict[str, Any]) -> None:
+        """:param variables: The local variables of a rollout, as callbacks get them"""
+        if not np.any(variables["dones"]):
+            return
+        returns = [info["episode"]["r"] for info in variables["infos"] if "episode" in info]
+        self.n_episodes += len(returns)
+        self.total_return += float(sum(returns))
+
+    def _on_step(self) -> bool:
+        self.count(self.locals)
+        return True
+
+
+class RouterProgress(BaseCallback):
+    """
+    Says on a progress bar how far the router's epoch is.
+
+    :param description: What to say
+    :param bar: A tqdm bar
+    :param n_instances: Instances of the epoch
+    """
+
+    def __init__(self, description: str, bar: Any, n_instances: int) -> None:
+        super().__init__()
+        self.description, self.bar, self.n_instances = description, bar, n_instances
+        self.n_episodes = 0
+
+    def _on_step(self) -> bool:
+        dones = self.locals["dones"]
+        if np.any(dones):
+            self.n_episodes += int(np.sum(dones))
+            n_samples = getattr(self.model, "n_samples", 1)
+            done = min(self.n_episodes / n_samples / self.n_instances, 1.0)
+            self.bar.set_description(f"{self.description} {done:4.0%}")
+        return True
+
+
+class ITSCallback(BaseCallback):
+    """
+    Trains a router beside the allocator and freezes one while the other learns.
+
+    Before the allocator's training the router learns on whole uniform instances (pre-training). Up to allocator epoch
+    ``n_intensive_epochs`` it learns for ``n_continuous_epochs`` epochs after every ``n_continuous_epochs``-th one, on the
+    shuffled subsets of that epoch's instances (intensive training); after that for one epoch after every one, on a random V-th
+    part of them (alternate training). Allocator and router are saved at every epoch's end, and a run goes on from there with
+    the same result as if it had not been interrupted.
+
+    :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
+        on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
+    :param n_epochs: Allocator epochs (the paper's E)
+    :param n_pretraining_epochs: Router epochs of pre-training (E_p)
+    :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
+    :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
+    :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
+    :param strategy: ``"ITS"``, or one of the paper's ablations: ``"ITS/pre-training"`` (without pre-training),
+        ``"ITS/intensive"`` (without intensive training), ``"ITS/pre-training&intensive"`` (neither), ``"independent"``
+        (DL-DRL-I: the router is only pre-trained)
+    :param save_path: Folder of the zips; that of the other callbacks or of the monitor files when None
+    :param resume_from: Folder written by an earlier run (its ``its_checkpoint``); train the allocator loaded from there
+    :param checkpoint_freq: Allocator epochs between checkpoints
+    :param verbose: Verbosity level: 0 for no output, 1 for a line per epoch
+    :raises ValueError: If an argument is not allowed; the message names it
+    """
+
+    def __init__(
+        self,
+        router: dict[str, Any],
+        n_epochs: int = 100,
+        n_pretraining_epochs: int = 5,
+        n_intensive_epochs: int = 8,
+        n_continuous_epochs: int = 4,
+        instances_per_epoch: int | None = None,
+        strategy: str = "ITS",
+        save_path: str | None = None,
+        resume_from: str | None = None,
+        checkpoint_freq: int = 1,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if strategy not in STRATEGIES:
+            raise ValueError(f"strategy is {strategy!r}; choose one of {STRATEGIES}.")
+        for name, value, least in (
+            ("n_epochs", n_epochs, 1),
+            ("n_pretraining_epochs", n_pretraining_epochs, 0),
+            ("n_intensive_epochs", n_intensive_epochs, 0),
+            ("n_continuous_epochs", n_continuous_epochs, 1),
+            ("checkpoint_freq", checkpoint_freq, 1),
+            ("instances_per_epoch", 1 if instances_per_epoch is None else instances_per_epoch, 1),
+        ):
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
+        if not isinstance(router, dict) or "policy" not in router:
+            raise ValueError(f"router must be a mapping with at least the key 'policy', found {router!r:.80}.")
+        self.router_kwargs = dict(router)
+        self.n_epochs = n_epochs
+        self.n_pretraining_epochs = 0 if strategy.startswith("ITS/pre-training") else n_pretraining_epochs
+        self.n_intensive_epochs = 0 if strategy.endswith("intensive") else n_intensive_epochs
+        self.n_continuous_epochs = n_continuous_epochs
+        self.instances_per_epoch = instances_per_epoch
+        self.strategy = strategy
+        self.save_path = None if save_path is None else Path(save_path)
+        self.resume_from = None if resume_from is None else Path(resume_from)
+        self.checkpoint_freq = checkpoint_freq
+
+        self.records: list[EpochRecord] = []
+        self.epoch = 0
+        self.router: OnPolicyAlgorithm
+        self._router_env: BatchedVecEnv
+        self._freezers: dict[str, Freezer] = {}
+        self._statistics = EpisodeStatistics()
+        self._started = False
+        self._epoch_start = 0.0
+        self._epoch_first_batch = 0
+        self._instances_at_start = 0
+        self._best_mean_reward = -np.inf
+
+    # ------------------------------------------------------------------------------------------------------ set-up
+
+    def _on_training_start(self) -> None:
+        problem = find_problem(self.training_env)
+        if not isinstance(problem, AllocationProblem) or not isinstance(self.model.policy, AllocatorPolicy):
+            raise ValueError(
+                "ITSCallback needs an AllocatorPolicy on a TaskAllocation environment, found "
+                f"{type(self.model.policy).__name__} on {self.training_env}."
+            )
+        self.problem = problem
+        own = getattr(self.model, "instances_per_epoch", None)
+        if self.instances_per_epoch is None:
+            if own is None:
+                raise ValueError(f"{type(self.model).__name__} has no instances_per_epoch; give it to ITSCallback.")
+            self.instances_per_epoch = own
+        elif own is not None and own != self.instances_per_epoch:
+            raise ValueError(
+                f"instances_per_epoch is {self.instances_per_epoch} in ITSCallback and {own} in "
+                f"{type(self.model).__name__}; give it once, to the algorithm."
+            )
+        if self.save_path is None:
+            self.save_path = self._find_save_path()
+        if not self._started:
+            self._make_router()
+            if self.resume_from is not None:
+                self._resume(self.resume_from)
+            elif self._instances_seen() > 0:
+                raise ValueError(
+                    "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
+                    f"{CHECKPOINT_FOLDER} folder of the earlier run."
+                )
+            self._started = True
+        self._hand_over_router()
+        if not self.records and self.n_pretraining_epochs > 0:
+            self._router_env.set_generator(WholeInstances(self.problem.generator))
+            self._train_router(self.n_pretraining_epochs, "pre-training")
+            self._save_checkpoint()
+        self._freezers["router"].freeze()
+        if isinstance(self.model, REINFORCE):
+            self.model.max_instances = self.n_epochs * self.instances_per_epoch
+        self._begin_epoch()
+
+    def _make_router(self) -> None:
+        kwargs = dict(self.router_kwargs)
+        algo, n_envs = kwargs.pop("algo", "reinforce"), kwargs.pop("n_envs", self.training_env.num_envs)
+        algorithm = resolve_algorithm(algo)
+        if kwargs["policy"] == "RouterPolicy":
+            kwargs["policy"] = RouterPolicy
+        generator = WholeInstances(self.problem.generator)
+        self._router_env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=generator)] * n_envs)
+        if algorithm is REINFORCE:
+            kwargs.setdefault("instances_per_epoch", self.instances_per_epoch)
+        # The next seed, because with the same one both levels would draw the same points.
+        seed = None if self.model.seed is None else self.model.seed + 1
+        try:
+            self.router = algorithm(env=self._router_env, seed=seed, device=self.model.device, **kwargs)
+        except TypeError as error:
+            raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
+        if not isinstance(self.router.policy, RouterPolicy):
+            raise ValueError(f"router: policy must be a RouterPolicy, found {type(self.router.policy).__name__}.")
+        outputs = [f for f in self.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
+        folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
+        self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
+        self._freezers = {"allocator": Freezer(self.model.policy), "router": Freezer(self.router.policy)}
+
+    def _hand_over_router(self) -> None:
+        assert isinstance(self.router.policy, RouterPolicy)
+        environments = [self.training_env, *(callback.eval_env for callback in self._siblings(EvalCallback))]
+        for env in environments:
+            env.env_method("set_router", self.router.policy.plan)
+
+    def _siblings(self, kind: type[BaseCallback]) -> list[Any]:
+        """The callbacks of this kind in the same training."""
+        return [callback for callback in walk_callbacks(self.locals.get("callback")) if isinstance(callback, kind)]
+
+    def _find_save_path(self) -> Path | None:
+        for callback in self._siblings(EvalCallback):
+            if callback.best_model_save_path is not None:
+                return Path(callback.best_model_save_path)
+        monitor = getattr(self.training_env.unwrapped, "monitor_folder", None)
+        if monitor is not None:
+            return Path(monitor)
+        return None if self.logger.dir is None else Path(self.logger.dir)
+
+    # ------------------------------------------------------------------------------------------------------ epochs
+
+    def _instances_seen(self) -> int:
+        """Instances that the allocator has learned from."""
+        if isinstance(self.model, REINFORCE):
+            return self.model.n_instances
+        return self.model.num_timesteps // self.problem.generator.n_tasks
+
+    def _begin_epoch(self) -> None:
+        self._statistics.reset_statistics()
+        self._epoch_start = time.time()
+        self._instances_at_start = self._instances_seen()
+        self._epoch_first_batch = getattr(self.model, "n_batches", 0)
+
+    def _on_rollout_start(self) -> None:
+        self._save_best_router()
+        if self._epoch_is_over():
+            self._end_epoch()
+
+    def _on_step(self) -> bool:
+        self._statistics.count(self.locals)
+        self._save_best_router()
+        return self.epoch < self.n_epochs
+
+    def _on_training_end(self) -> None:
+        # rl_zoo3 calls this a second time, and after Ctrl-C, when training the router for an epoch is not wanted.
+        finished = self.model.num_timesteps >= self.model._total_timesteps
+        if self._started and finished and self._epoch_is_over():
+            self._end_epoch()
+
+    def _epoch_is_over(self) -> bool:
+        assert self.instances_per_epoch is not None
+        return self.epoch < self.n_epochs and self._instances_seen() >= (self.epoch + 1) * self.instances_per_epoch
+
+    def _end_epoch(self) -> None:
+        """What Algorithm 1 does after every epoch of the allocator (lines 10 to 23)."""
+        self.epoch += 1
+        n_instances = self._instances_seen() - self._instances_at_start
+        phase = "intensive" if self.epoch <= self.n_intensive_epochs else "alternate"
+        self._record("allocator", self.epoch, phase, n_instances, self._statistics.mean_return, self._epoch_start)
+        if self.strategy != "independent":
+            n_uavs = self.problem.generator.n_uavs
+            if phase == "alternate":
+                self._train_on_subsets(1, 1 / n_uavs, phase)
+            elif self.epoch % self.n_continuous_epochs == 0:
+                self._train_on_subsets(self.n_continuous_epochs, 1.0, phase)
+        if self.epoch % self.checkpoint_freq == 0 or self.epoch == self.n_epochs:
+            self._save_checkpoint()
+        self._begin_epoch()
+
+    def _train_on_subsets(self, n_epochs: int, fraction: float, phase: str) -> None:
+        assert isinstance(self.model.policy, AllocatorPolicy)
+        n_batches = getattr(self.model, "n_batches", 0) - self._epoch_first_batch
+        if isinstance(self.model, REINFORCE):
+            first, draw_batch = self._epoch_first_batch, self.model.draw_batch
+        else:
+            # SB3's algorithms do not replay instances: new ones of the same distribution.
+            first, n_batches, draw_batch = 0, self._batches_per_epoch(), self._draw_new_batch
+        self._router_env.set_generator(
+            AllocatedSubsets(
+                self.model.policy,
+                self.problem.generator,
+                draw_batch,
+                range(first, first + n_batches),
+                fraction,
+                lambda chunk: np.random.default_rng([self._seed(), SUBSET_STREAM, self.epoch, chunk]),
+            )
+        )
+        self._freezers["allocator"].freeze()
+        self._freezers["router"].thaw()
+        try:
+            self._train_router(n_epochs, phase)
+        finally:
+            self._freezers["router"].freeze()
+            self._freezers["allocator"].thaw()
+
+    def _batches_per_epoch(self) -> int:
+        assert self.instances_per_epoch is not None
+        return -(-self.instances_per_epoch // self.training_env.num_envs)
+
+    def _draw_new_batch(self, index: int) -> Any:
+        rng = np.random.default_rng([self._seed(), SUBSET_STREAM + 1, self.epoch, index])
+        return self.problem.generator(self.training_env.num_envs, rng)
+
+    def _seed(self) -> int:
+        return getattr(self.model, "stream_seed", None) or self.model.seed or 0
+
+    def _train_router(self, n_epochs: int, phase: str) -> None:
+        assert self.instances_per_epoch is not None
+        for index in range(n_epochs):
+            start = time.time()
+            number = 1 + sum(record.level == "router" for record in self.records)
+            statistics = EpisodeStatistics()
+            with_bar, close_bar = self._progress(f"router, {phase} {index + 1}/{n_epochs}")
+            callbacks = [statistics, *with_bar]
+            try:
+                self._learn_router(callbacks)
+            finally:
+                close_bar()
+            self._record("router", number, phase, self.instances_per_epoch, statistics.mean_return, start)
+        self.router.policy.set_training_mode(False)
+
+    def _learn_router(self, callbacks: list[BaseCallback]) -> None:
+        """Let the router learn for one epoch."""
+        assert self.instances_per_epoch is not None
+        if isinstance(self.router, REINFORCE):
+            self.router.learn_instances(self.instances_per_epoch, CallbackList(callbacks))
+            return
+        n_episodes = -(-self.instances_per_epoch // self.router.n_envs)
+        callbacks = [*callbacks, StopTrainingOnMaxEpisodes(n_episodes)]
+        # SB3 keeps the last observation of the previous generator's instances otherwise.
+        self.router._last_obs = None
+        limit = NO_STEP_LIMIT - self.router.num_timesteps
+        self.router.learn(limit, CallbackList(callbacks), reset_num_timesteps=False)
+
+    def _progress(self, description: str) -> tuple[list[BaseCallback], Any]:
+        """A callback that reports on the run's progress bar, if there is one, and what to call afterwards."""
+        bars = self._siblings(ProgressBarCallback)
+        if not bars:
+            return [], lambda: None
+        assert self.instances_per_epoch is not None
+        if getattr(bars[0], "pbar", None) is None:
+            # Pre-training: the allocator's bar does not exist yet.
+            bar = ProgressBarCallback.__init__.__globals__["tqdm"](total=1, bar_format="{desc}")
+            return [RouterProgress(description, bar, self.instances_per_epoch)], bar.close
+        bar = bars[0].pbar
+        return [RouterProgress(description, bar, self.instances_per_epoch)], lambda: bar.set_description("allocator")
+
+    # ------------------------------------------------------------------------------------------------------ files
+
+    def _record(self, level: str, epoch: int, phase: str, n_instances: int, objective: float, start: float) -> None:
+        record = EpochRecord(epoch, level, phase, n_instances, objective, round(time.time() - start, 3))
+        self.records.append(record)
+        self.logger.record(f"its/{level}_epoch", epoch)
+        self.logger.record(f"its/{level}_objective", objective)
+        if self.verbose > 0:
+            print(f"{level} epoch {epoch} ({phase}): mean objective {objective:.2f}, {record.seconds:.1f} s")
+        if self.save_path is not None:
+            write_atomically(self.save_path / LOG_FILE, self._log_text())
+
+    def _log_text(self) -> str:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(EpochRecord.__annotations__))
+        writer.writeheader()
+        writer.writerows(asdict(record) for record in self.records)
+        return text.getvalue()
+
+    def _save_router(self) -> None:
+        if self.save_path is not None:
+            save_atomically(self.router, self.save_path / "router.zip")
+
+    def _save_best_router(self) -> None:
+        """Keep the router that the best allocator was evaluated with."""
+        for callback in self._siblings(EvalCallback):
+            if callback.best_mean_reward > self._best_mean_reward and callback.best_model_save_path is not None:
+                self._best_mean_reward = callback.best_mean_reward
+                save_atomically(self.router, Path(callback.best_model_save_path) / "best_router.zip")
+
+    def _save_checkpoint(self) -> None:
+        """
+        Write both zips and the state of the strategy.
+
+        The state names the zips it belongs to and is replaced last, so the folder is consistent at any moment.
+        """
+        self._save_router()
+        if self.save_path is None:
+            return
+        folder = self.save_path / CHECKPOINT_FOLDER
+        names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self.epoch}.zip"}
+        save_atomically(self.model, folder / names["allocator"])
+        save_atomically(self.router, folder / names["router"])
+        state = {"epoch": self.epoch, **names, "records": [asdict(record) for record in self.records]}
+        write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
+        for old in folder.glob("*.zip"):
+            if old.name not in names.values():
+                old.unlink()
+
+    def _resume(self, folder: Path) -> None:
+        state = read_state(folder)
+        if isinstance(self.model, REINFORCE) and self.model.epoch != state["epoch"]:
+            raise ValueError(
+                f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {self.model.epoch}; "
+                f"train the allocator of {folder / state['allocator']}."
+            )
+        self.epoch = state["epoch"]
+        self.records = [EpochRecord(**record) for record in state["records"]]
+        loaded = type(self.router).load(folder / state["router"], env=self._router_env, device=self.model.device)
+        loaded.set_logger(self.router.logger)
+        self.router = loaded
+        self._freezers["router"] = Freezer(self.router.policy)
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """
+    :param folder: A checkpoint of :class:`ITSCallback`
+    :return: What its state file says: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``
+    :raises FileNotFoundError: If there is none
+    :raises ValueError: If it is damaged
+    """
+    path = Path(folder) / STATE_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
+    try:
+        state = json.loads(path.read_text())
+        missing = {"epoch", "allocator", "router", "records"} - set(state)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not an intact state file ({error}); resume from another checkpoint.") from error
+    if missing:
+        raise ValueError(f"{path}: fields {sorted(missing)} are missing; resume from another checkpoint.")
+    return state
+
+
+def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
+    """
+    :param name: ``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or a dotted path
+    :raises ValueError: If there is no such on-policy algorithm
+    """
+    if name in ALGORITHMS:
+        return ALGORITHMS[name]
+    module_name, _, class_name = name.rpartition(".")
+    try:
+        algorithm = getattr(import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        choices = ", ".join(ALGORITHMS)
+        raise ValueError(f"router: algo is {name!r}; choose one of {choices} or give a dotted path.") from error
+    if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
+        raise ValueError(f"router: algo {name!r} is not an on-policy algorithm of SB3.")
+    return algorithm
+
+
+def walk_callbacks(callback: Any) -> Iterator[BaseCallback]:
+    """
+    :param callback: A callback or None
+    :return: It and all callbacks inside it
+    """
+    if isinstance(callback, CallbackList):
+        for child in callback.callbacks:
+            yield from walk_callbacks(child)
+    elif isinstance(callback, BaseCallback):
+        yield callback
+        if isinstance(callback, EventCallback):
+            yield from walk_callbacks(callback.callback)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """
+    :param path: The file to write; its folder is made if need be
+    :param text: What to write
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_text(text)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,109 @@
+"""The router's training instances: what the current allocator gives to the UAVs (``data_gen`` of the paper's Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch as th
+
+from sb3_uav.envs.allocation import split_tasks
+from sb3_uav.envs.instances import InstanceGenerator, Instances
+from sb3_uav.policies import AllocatorPolicy
+
+
+class WholeInstances:
+    """
+    Instances with all their tasks for one UAV: what the router is pre-trained on.
+
+    :param generator: Draws the instances of the fleet
+    """
+
+    n_uavs = 1
+
+    def __init__(self, generator: InstanceGenerator) -> None:
+        self.generator = generator
+        self.n_tasks = generator.n_tasks
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return replace(self.generator(batch_size, rng), n_uavs=1)
+
+
+class AllocatedSubsets:
+    """
+    Shuffled single-UAV subsets of the instances of one allocator epoch, allocated by sampling from the current allocator.
+
+    Instances are taken ``shuffle_batches`` batches at a time and the subsets of these are shuffled, which breaks the
+    correlation between the subsets of an instance without holding a whole epoch in memory. After the last batch it starts
+    again with the first one and new samples.
+
+    :param allocator: The allocator
+    :param generator: Draws the instances of the fleet, for :meth:`held_out`
+    :param draw_batch: Training instances by number of the batch
+    :param batches: The numbers of the epoch's batches
+    :param fraction: Part of the subsets to use, chosen at random
+    :param stream: Random generator by number of the chunk
+    :param shuffle_batches: Batches per chunk
+    """
+
+    n_uavs = 1
+
+    def __init__(
+        self,
+        allocator: AllocatorPolicy,
+        generator: InstanceGenerator,
+        draw_batch: Callable[[int], Instances],
+        batches: Sequence[int],
+        fraction: float,
+        stream: Callable[[int], np.random.Generator],
+        shuffle_batches: int = 8,
+    ) -> None:
+        self.allocator = allocator
+        self.generator = generator
+        self.n_tasks = generator.n_tasks
+        self.draw_batch = draw_batch
+        self.batches = batches
+        self.fraction = fraction
+        self.stream = stream
+        self.shuffle_batches = shuffle_batches
+        self._next_batch = 0
+        self._n_chunks = 0
+        self._ready: Instances | None = None
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """``rng`` is not used: the subsets follow from the allocator and the numbers of the batches."""
+        while self._ready is None or len(self._ready) < batch_size:
+            chunk = self._next_chunk()
+            self._ready = chunk if self._ready is None else Instances.concatenate([self._ready, chunk])
+        drawn, self._ready = self._ready[:batch_size], self._ready[batch_size:]
+        return drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+
+    def _next_chunk(self) -> Instances:
+        rng = self.stream(self._n_chunks)
+        self._n_chunks += 1
+        parts = []
+        for _ in range(min(self.shuffle_batches, len(self.batches))):
+            parts.append(self.draw_batch(self.batches[self._next_batch]))
+            self._next_batch = (self._next_batch + 1) % len(self.batches)
+        subsets = self._allocate(Instances.concatenate(parts), rng)
+        kept = rng.permutation(len(subsets))[: max(round(self.fraction * len(subsets)), 1)]
+        return subsets[kept]
+
+    def _allocate(self, instances: Instances, rng: np.random.Generator) -> Instances:
+        device = self.allocator.device
+        generator = th.Generator(device).manual_seed(int(rng.integers(2**63 - 1)))
+        self.allocator.set_training_mode(False)
+        actions = self.allocator.decode_episodes(instances.to(device), deterministic=False, generator=generator)
+        return split_tasks(instances, actions.cpu()).instances
+
+    def held_out(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        Subsets of fresh instances, for the baseline's test.
+
+        :param batch_size: Number of subsets
+        :param rng: The source of randomness
+        """
+        instances = self.generator(-(-batch_size // self.generator.n_uavs), rng)
+        subsets = self._allocate(instances, rng)
+        return subsets[rng.permutation(len(subsets))[:batch_size]]

@@ -1,0 +1,117 @@
+"""What the tests of the environments share: settings, strategies that draw instances, and small plain-Python helpers."""
+
+from __future__ import annotations
+
+import os
+
+# Before anything imports matplotlib: tests never open a window.
+os.environ["MPLBACKEND"] = "Agg"
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import settings
+from hypothesis import strategies as st
+
+from sb3_uav.envs import Instances, UniformGenerator
+from sb3_uav.envs.problem import Dynamics
+
+# Repeatable on CI; `--hypothesis-profile=explore` searches on.
+settings.register_profile("repeatable", deadline=None, derandomize=True, print_blob=True)
+settings.register_profile("explore", deadline=None, print_blob=True)
+settings.load_profile("repeatable")
+
+# Tiny tensors: more threads only get into each other's way.
+th.set_num_threads(1)
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def small() -> Instances:
+    """Three instances of 5 tasks and 2 UAVs."""
+    return UniformGenerator(n_tasks=5, n_uavs=2)(3, np.random.default_rng(1))
+
+
+@st.composite
+def layouts(draw: st.DrawFn, n_tasks: int) -> np.ndarray:
+    """A depot and ``n_tasks`` tasks, ``(n_tasks + 1, 2)``, in about the unit square: in general position, or far from it."""
+    generator = np.random.default_rng(draw(seeds))
+    kind = draw(st.sampled_from(["uniform", "lattice", "line", "pairs", "point"]))
+    if kind == "uniform":
+        return generator.random((n_tasks + 1, 2))
+    if kind == "lattice":
+        return generator.integers(0, 4, (n_tasks + 1, 2)) / 4
+    if kind == "line":
+        direction = generator.normal(size=2)
+        return generator.random((n_tasks + 1, 1)) * direction / np.linalg.norm(direction)
+    if kind == "pairs":
+        return generator.random((3, 2))[generator.integers(0, 3, n_tasks + 1)]
+    return np.repeat(generator.random((1, 2)), n_tasks + 1, axis=0)
+
+
+@st.composite
+def instance_batches(draw: st.DrawFn, max_tasks: int = 8, max_batch: int = 3, uniform_size: bool = False) -> Instances:
+    """
+    Batches of instances of every kind that is allowed: one task, coincident and collinear points, values 0, padded rows, more
+    UAVs than tasks, coordinates and distances of any magnitude, and distances too short for any task.
+
+    :param max_tasks: Largest number of tasks
+    :param max_batch: Largest batch
+    :param uniform_size: Whether to leave out padding
+    """
+    batch_size = draw(st.integers(1, max_batch))
+    n_tasks = draw(st.integers(1, max_tasks))
+    scale = draw(st.sampled_from([1.0, 1.0, 1e-12, 1e-3, 1e6, 1e12]))
+    offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1000.0]))
+    points = scale * (offset + np.stack([draw(layouts(n_tasks)) for _ in range(batch_size)]))
+    reach = draw(st.lists(st.sampled_from([1e-9, 0.3, 1.0, 2.0, 3.0, 40.0]), min_size=batch_size, max_size=batch_size))
+    generator = np.random.default_rng(draw(seeds))
+    values = None
+    if draw(st.booleans()):
+        values = generator.random((batch_size, n_tasks)) * 10 * (generator.random((batch_size, n_tasks)) < 0.7)
+    n_real = np.full(batch_size, n_tasks) if uniform_size else generator.integers(1, n_tasks + 1, batch_size)
+    return Instances.from_arrays(
+        depot=points[:, 0],
+        tasks=points[:, 1:],
+        values=values,
+        max_distance=scale * np.array(reach),
+        n_uavs=draw(st.integers(1, 5)),
+        task_mask=np.arange(n_tasks) < n_real[:, None],
+    )
+
+
+def random_legal(mask: th.Tensor, generator: np.random.Generator) -> th.Tensor:
+    """
+    One legal action per row, uniformly.
+
+    :param mask: ``(..., n_actions)`` bool
+    :param generator: The source of randomness
+    :return: ``(...)`` int64
+    """
+    scores = th.from_numpy(generator.random(tuple(mask.shape)))
+    return scores.masked_fill(~mask, -1.0).argmax(-1)
+
+
+def play_randomly(dynamics: Dynamics, n_samples: int, generator: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Complete episodes of random legal actions.
+
+    :param dynamics: Of ``batch`` instances
+    :param n_samples: Episodes per instance
+    :param generator: The source of randomness
+    :return: Actions ``(batch, n_samples, n_steps)`` int64, and the reward of each, float64
+    """
+    state = dynamics.reset(n_samples)
+    actions, rewards = [], []
+    while not state.done.all() or not actions:
+        chosen = random_legal(state.action_mask, generator)
+        state, reward = dynamics.step(state, chosen)
+        actions.append(chosen)
+        rewards.append(reward)
+    return th.stack(actions, dim=-1), th.stack(rewards, dim=-1)
