@@ -5,7 +5,8 @@ import gymnasium as gym
 PAPER_FLEETS = (4, 6)
 PAPER_SIZES = (80, 100, 150, 200, 300, 500)
 GENERALISATION_SIZES = (600, 700, 800, 900, 1000, 1500)
-DEMO_FLEET, DEMO_SIZE = 3, 20
+# With the paper's D = 2.0, nearly all of so few tasks could be visited, and there would be little to learn.
+DEMO_FLEET, DEMO_SIZE, DEMO_MAX_DISTANCE = 3, 20, 1.5
 
 
 def allocation_id(n_uavs: int, n_tasks: int) -> str:
@@ -17,16 +18,19 @@ def routing_id(n_tasks: int) -> str:
 
 
 def register_envs() -> None:
-    """Register every scenario of the paper and the small one of the demo; registering twice changes nothing."""
+    """Register every scenario of the paper (D = 2.0) and the small one of the demo; registering twice changes nothing."""
     sizes = (*PAPER_SIZES, *GENERALISATION_SIZES)
-    scenarios = [(n_uavs, n_tasks) for n_uavs in PAPER_FLEETS for n_tasks in sizes]
-    for n_uavs, n_tasks in (*scenarios, (DEMO_FLEET, DEMO_SIZE)):
-        _register(allocation_id(n_uavs, n_tasks), "allocation:TaskAllocationEnv", n_tasks, n_uavs=n_uavs)
-    for n_tasks in (*sizes, DEMO_SIZE):
+    for n_uavs in PAPER_FLEETS:
+        for n_tasks in sizes:
+            _register(allocation_id(n_uavs, n_tasks), "allocation:TaskAllocationEnv", n_tasks, n_uavs=n_uavs)
+    for n_tasks in sizes:
         _register(routing_id(n_tasks), "routing:RoutePlanningEnv", n_tasks)
+    demo = {"max_distance": DEMO_MAX_DISTANCE}
+    _register(allocation_id(DEMO_FLEET, DEMO_SIZE), "allocation:TaskAllocationEnv", DEMO_SIZE, n_uavs=DEMO_FLEET, **demo)
+    _register(routing_id(DEMO_SIZE), "routing:RoutePlanningEnv", DEMO_SIZE, **demo)
 
 
-def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: int) -> None:
+def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: float) -> None:
     if env_id not in gym.registry:
         gym.register(
             id=env_id,

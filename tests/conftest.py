@@ -98,18 +98,21 @@ def random_legal(mask: th.Tensor, generator: np.random.Generator) -> th.Tensor:
     return scores.masked_fill(~mask, -1.0).argmax(-1)
 
 
-def play_randomly(dynamics: Dynamics, n_samples: int, generator: np.random.Generator) -> tuple[th.Tensor, th.Tensor]:
+def play_randomly(
+    dynamics: Dynamics, n_samples: int, generator: np.random.Generator, min_steps: int = 1
+) -> tuple[th.Tensor, th.Tensor]:
     """
     Complete episodes of random legal actions.
 
     :param dynamics: Of ``batch`` instances
     :param n_samples: Episodes per instance
     :param generator: The source of randomness
+    :param min_steps: How many steps to play even if all episodes are over
     :return: Actions ``(batch, n_samples, n_steps)`` int64, and the reward of each, float64
     """
     state = dynamics.reset(n_samples)
     actions, rewards = [], []
-    while not state.done.all() or not actions:
+    while len(actions) < min_steps or not state.done.all():
         chosen = random_legal(state.action_mask, generator)
         state, reward = dynamics.step(state, chosen)
         actions.append(chosen)

@@ -341,8 +341,11 @@ def distance_limit(max_distance: th.Tensor) -> th.Tensor:
 class InstanceGenerator(Protocol):
     """Draws instances of one size. Stateless: the same ``rng`` state gives the same instances."""
 
-    n_tasks: int
-    n_uavs: int
+    @property
+    def n_tasks(self) -> int: ...
+
+    @property
+    def n_uavs(self) -> int: ...
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
@@ -444,11 +447,11 @@ class FixedGenerator:
     instances: Instances
 
     @property
-    def n_tasks(self) -> int:  # type: ignore[override]
+    def n_tasks(self) -> int:
         return self.instances.n_tasks
 
     @property
-    def n_uavs(self) -> int:  # type: ignore[override]
+    def n_uavs(self) -> int:
         return self.instances.n_uavs
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:

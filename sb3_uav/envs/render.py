@@ -15,6 +15,8 @@ logger = logging.getLogger(__name__)
 # Okabe and Ito's palette, readable with colour-vision deficiencies.
 UAV_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C6D31", "#000000")
 
+MARGINS = {"left": 0.1, "right": 0.9, "bottom": 0.1, "top": 0.9}
+
 
 def require_matplotlib() -> Any:
     """
@@ -86,6 +88,8 @@ class MapFigure:
         """Replace what is drawn; see :func:`draw_map`."""
         self.axes.clear()
         draw_map(self.axes, instances, row, routes)
+        # tight_layout starts from the last layout: without a fresh start the same map would look different the second time.
+        self.figure.subplots_adjust(**MARGINS)
         self.figure.tight_layout()
 
     def rgb_array(self) -> np.ndarray:

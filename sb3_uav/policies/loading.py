@@ -107,6 +107,9 @@ def _read_zip(file: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
     try:
         with zipfile.ZipFile(file) as archive:
+            # Of a truncated SB3 zip, zipfile may open a zip of tensors that lies inside, and take the rest for a preamble.
+            if min((member.header_offset for member in archive.infolist()), default=0) > 0:
+                raise zipfile.BadZipFile("its table of contents is missing")
             missing = {"data", "policy.pth"} - set(archive.namelist())
             if missing:
                 raise ValueError(

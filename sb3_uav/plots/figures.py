@@ -1,0 +1,50 @@
+"""Figures without pyplot's global state, and how they reach the disk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from sb3_uav.envs.render import require_matplotlib
+
+SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def checked_path(path: str | os.PathLike[str]) -> Path:
+    """
+    :param path: Where a figure is going to be written
+    :return: The same
+    :raises ValueError: If its suffix is not one of :data:`SUFFIXES`
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{path}: the suffix of a figure must be one of {SUFFIXES}, found {path.suffix!r}.")
+    return path
+
+
+def new_figure(width: float, height: float) -> Any:
+    """
+    :param width: In inches
+    :param height: In inches
+    :return: An empty matplotlib figure that lays itself out
+    :raises ImportError: If matplotlib is not installed
+    """
+    return require_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """
+    Write a figure under a temporary name and rename it.
+
+    :param figure: The figure
+    :param path: From :func:`checked_path`; its folder is created if missing
+    """
+    temporary = path.with_name(path.name + ".tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        # Legends below a map lie outside its axes, which the layout does not always leave room for.
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=150, bbox_inches="tight", pad_inches=0.12)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

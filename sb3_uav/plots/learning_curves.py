@@ -1,0 +1,116 @@
+"""Learning curves of both levels from the log of the interactive training strategy (paper, Fig. 4)."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+
+LEVELS = ("allocator", "router")
+COLUMNS = {"epoch", "level", "phase", "objective"}
+PHASE_COLOURS = {"pre-training": "#56B4E9", "intensive": "#E69F00", "alternate": "#009E73"}
+SPELLINGS = {"pretraining": "pre-training"}
+LINE_COLOUR = "#222222"
+# With more epochs than this, markers hide the line.
+MAX_MARKERS = 40
+
+
+class LoggedEpoch(NamedTuple):
+    """
+    :param epoch: Number of the epoch of its level, from 1
+    :param phase: Phase of the strategy
+    :param objective: Mean objective of the training episodes
+    """
+
+    epoch: int
+    phase: str
+    objective: float
+
+
+def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """
+    Draw the mean objective of every epoch, the allocator above and the router below, phases of the strategy shaded.
+
+    :param its_log: The ``its_log.csv`` of a run
+    :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
+    :raises FileNotFoundError: If there is no such log
+    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers, or the suffix of the
+        figure is not allowed
+    :raises ImportError: If matplotlib is not installed
+    """
+    path = checked_path(path)
+    epochs = read_its_log(its_log)
+    figure = new_figure(8.0, 6.4)
+    titles = ("Upper level (allocator), all UAVs", "Lower level (router), per UAV")
+    for axes, level, title in zip(figure.subplots(2, 1), LEVELS, titles, strict=True):
+        _draw_level(axes, epochs[level])
+        axes.set_title(title, fontsize=11, loc="left")
+    save_figure(figure, path)
+
+
+def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]]:
+    """
+    :param its_log: The ``its_log.csv`` of a run
+    :return: The epochs of each level, in order; a level may have none
+    :raises FileNotFoundError: If there is no such log
+    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers
+    """
+    its_log = Path(its_log)
+    if not its_log.is_file():
+        raise FileNotFoundError(f"{its_log}: no such log; give the its_log.csv of a run of the interactive training strategy.")
+    epochs: dict[str, list[LoggedEpoch]] = {level: [] for level in LEVELS}
+    with its_log.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        missing = COLUMNS - set(reader.fieldnames or ())
+        if missing:
+            raise ValueError(f"{its_log}: columns {sorted(missing)} are missing; found {reader.fieldnames}.")
+        for row in reader:
+            where = f"{its_log}, line {reader.line_num}"
+            if row["level"] not in epochs:
+                raise ValueError(f"{where}: level is {row['level']!r}, expected one of {LEVELS}.")
+            phase = SPELLINGS.get(row["phase"], row["phase"])
+            try:
+                epochs[row["level"]].append(LoggedEpoch(int(row["epoch"]), phase, float(row["objective"])))
+            except (TypeError, ValueError) as error:
+                found = f"{row['epoch']!r} and {row['objective']!r}"
+                raise ValueError(f"{where}: epoch and objective must be numbers, found {found}.") from error
+    if not any(epochs.values()):
+        raise ValueError(f"{its_log}: holds no epochs yet; wait until the first one has finished.")
+    return {level: sorted(rows) for level, rows in epochs.items()}
+
+
+def _draw_level(axes: Any, epochs: Sequence[LoggedEpoch]) -> None:
+    """
+    :param axes: matplotlib axes
+    :param epochs: Of one level, in order
+    """
+    axes.set_xlabel("epoch")
+    axes.set_ylabel("tasks completed (mean)")
+    axes.grid(axis="y", color="0.85", linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    if not epochs:
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "no epochs", transform=axes.transAxes, ha="center", va="center", color="0.5")
+        return
+    labelled: set[str] = set()
+    for phase, run in groupby(epochs, key=lambda epoch: epoch.phase):
+        numbers = [epoch.epoch for epoch in run]
+        if phase not in PHASE_COLOURS:
+            continue
+        label = None if phase in labelled else phase
+        labelled.add(phase)
+        axes.axvspan(numbers[0] - 0.5, numbers[-1] + 0.5, color=PHASE_COLOURS[phase], alpha=0.2, linewidth=0, label=label)
+    marker = "o" if len(epochs) <= MAX_MARKERS else None
+    numbers, objectives = [epoch.epoch for epoch in epochs], [epoch.objective for epoch in epochs]
+    axes.plot(numbers, objectives, color=LINE_COLOUR, linewidth=1.5, marker=marker, markersize=4)
+    axes.set_xlim(numbers[0] - 0.5, numbers[-1] + 0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    if labelled:
+        # Above the panel, where the colours stand on white as they do in the panel.
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), fontsize=9, frameon=False, ncols=len(labelled))

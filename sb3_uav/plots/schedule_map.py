@@ -1,0 +1,74 @@
+"""Schedules drawn on a map, one or several beside each other (paper, Fig. 3)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.render import draw_map
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+
+PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
+# Two UAVs stand side by side in the legend below a map.
+LEGEND_LINE_HEIGHT = 0.2
+MAX_COLUMNS = 4
+
+
+class MapPanel(NamedTuple):
+    """
+    One map of a figure.
+
+    :param instances: The instances
+    :param row: Which of them
+    :param schedule: What to draw
+    :param title: Title of the panel
+    """
+
+    instances: Instances
+    row: int
+    schedule: Schedule
+    title: str = ""
+
+
+def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str | os.PathLike[str], title: str = "") -> None:
+    """
+    Draw one schedule: the depot, tours coloured by UAV, skipped tasks hollow, counts and lengths in the legend.
+
+    :param instances: The instances
+    :param row: Which of them
+    :param schedule: The schedule
+    :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
+    :param title: Title of the figure
+    :raises ValueError: If the suffix of the file is another one
+    :raises ImportError: If matplotlib is not installed
+    """
+    plot_schedules([MapPanel(instances, row, schedule, title)], path)
+
+
+def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> None:
+    """
+    Draw several schedules beside each other, :data:`MAX_COLUMNS` in a line.
+
+    :param panels: What to draw
+    :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
+    :raises ValueError: If there are no panels, or the suffix of the file is another one
+    :raises ImportError: If matplotlib is not installed
+    """
+    path = checked_path(path)
+    if not panels:
+        raise ValueError("There is nothing to draw: give at least one panel.")
+    n_columns = min(len(panels), MAX_COLUMNS)
+    n_lines = math.ceil(len(panels) / n_columns)
+    legend_lines = math.ceil((1 + max(len(panel.schedule.routes) for panel in panels)) / 2)
+    height = PANEL_HEIGHT + LEGEND_LINE_HEIGHT * legend_lines
+    figure = new_figure(PANEL_WIDTH * n_columns, height * n_lines)
+    grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
+    for axes, panel in zip(grid, panels, strict=False):
+        draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    save_figure(figure, path)

@@ -1,0 +1,86 @@
+"""``python -m sb3_uav.zoo.enjoy``: rl_zoo3's replay, with the router that was trained beside the allocator."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import sb3_uav  # noqa: F401  (registers the environment ids)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Replay a trained agent; every flag of ``rl_zoo3.enjoy`` works.
+
+    :param argv: Command line arguments; those of the process when None
+    :return: Exit code
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _enjoy(arguments)
+    except (ValueError, AssertionError, FileNotFoundError, ImportError) as error:
+        print(f"sb3_uav.zoo.enjoy: {error}", file=sys.stderr)
+        return 2
+
+
+def _enjoy(arguments: list[str]) -> int:
+    from sb3_uav.zoo.experiment import ExperimentManager, make_batched_vec_env, register_algorithms, rl_zoo3
+
+    register_algorithms()
+    import rl_zoo3.enjoy
+    from huggingface_sb3 import EnvironmentName
+    from rl_zoo3.utils import create_test_env, get_model_path
+
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo", default="reinforce")
+    parser.add_argument("--env", type=EnvironmentName, default="CartPole-v1")
+    parser.add_argument("-f", "--folder", default="logs")
+    parser.add_argument("--exp-id", default=0, type=int)
+    parser.add_argument("--load-best", action="store_true")
+    parser.add_argument("--load-checkpoint", type=int)
+    parser.add_argument("--load-last-checkpoint", action="store_true")
+    known, _ = parser.parse_known_args(arguments)
+    which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
+    _, _, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
+    router = find_router(Path(run_folder), known.load_best)
+
+    # A plain function would become a method of the class that it is set on.
+    ExperimentManager.default_vec_env_cls = staticmethod(make_batched_vec_env)  # type: ignore[assignment]
+    rl_zoo3.enjoy.create_test_env = partial(_create_test_env, create_test_env, router)
+    previous = sys.argv
+    sys.argv = ["sb3_uav.zoo.enjoy", "--algo", known.algo, "-f", known.folder, *arguments]
+    try:
+        rl_zoo3.enjoy.enjoy()
+    finally:
+        sys.argv = previous
+    return 0
+
+
+def find_router(run_folder: Path, best: bool) -> Path | None:
+    """
+    :param run_folder: Where the allocator's zip lies
+    :param best: Whether the router of the best allocator is wanted
+    :return: The router's zip, if the run has one
+    """
+    names = ["best_router.zip", "router.zip"] if best else ["router.zip"]
+    return next((run_folder / name for name in names if (run_folder / name).is_file()), None)
+
+
+def _create_test_env(create_test_env: Any, router: Path | None, env_id: str, **kwargs: Any) -> Any:
+    """``rl_zoo3.utils.create_test_env``, and hand the router to the environment."""
+    from sb3_uav.policies import RouterPolicy
+    from sb3_uav.policies.loading import load_policy
+
+    env = create_test_env(env_id, **kwargs)
+    if router is not None and env.has_attr("set_router"):
+        env.env_method("set_router", load_policy(router, expected=RouterPolicy).plan)
+        print(f"Rewards come from the router {router}")
+    return env
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""rl_zoo3 with our algorithms, environments and YAMLs."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+try:
+    import rl_zoo3
+    import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
+except ImportError as error:
+    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
+
+from sb3_contrib import MaskablePPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+import sb3_uav
+from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training import ITSCallback
+
+OUR_ALGORITHMS = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
+# What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
+ZOO_KEYS = {
+    "n_envs",
+    "n_timesteps",
+    "normalize",
+    "env_wrapper",
+    "vec_env_wrapper",
+    "callback",
+    "env_kwargs",
+    "monitor_kwargs",
+    "frame_stack",
+    "noise_type",
+    "noise_std",
+}
+
+
+def register_algorithms() -> None:
+    """Make our algorithms known to rl_zoo3; train, enjoy and the experiment manager share this dict."""
+    rl_zoo3.ALGOS.update(OUR_ALGORITHMS)
+
+
+def default_config(algo: str) -> Path | None:
+    """
+    :param algo: Name of an algorithm
+    :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none
+    """
+    package = Path(sb3_uav.__file__).parent
+    candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:
+    """
+    ``BatchedVecEnv`` for our environments, ``DummyVecEnv`` for all others and for wrapped ones.
+
+    :param env_fns: One function per row
+    """
+    env = env_fns[0]()
+    if unwrap_problem_env(env) is None:
+        env.close()
+        return DummyVecEnv(env_fns)
+    return BatchedVecEnv([lambda: env, *env_fns[1:]])
+
+
+class UAVExperimentManager(ExperimentManager):
+    """
+    rl_zoo3's experiment manager, with our vectorized environment and without these traps of rl_zoo3 2.9.2:
+
+    - ``env_kwargs`` of a YAML reach the evaluation environment too;
+    - ``const_X`` is a constant, and numbers that YAML reads as strings (``1e-3``) are numbers;
+    - a misspelled key is named, with the nearest known one.
+    """
+
+    def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
+        super().__init__(args, *positional, **kwargs)
+        if kwargs.get("vec_env_type", "dummy") == "dummy":
+            self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        except (yaml.YAMLError, FileNotFoundError) as error:
+            raise ValueError(f"{self.config}: cannot be read: {error}") from error
+        if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
+            raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
+        check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], f"{self.config}, {self.env_name.gym_id}")
+        return hyperparams, saved
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        try:
+            processed = super()._preprocess_hyperparams(hyperparams)
+        except TypeError as error:
+            raise ValueError(f"{self.config}: an argument of 'callback' does not fit: {error}") from error
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = self.env_kwargs
+        return processed
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        for key in ("learning_rate", "clip_range", "clip_range_vf", "delta_std", "ent_coef"):
+            if isinstance(hyperparams.get(key), str):
+                hyperparams[key] = parse_schedule(key, hyperparams[key])
+        return hyperparams
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        for callback in self.callbacks:
+            if isinstance(callback, ITSCallback):
+                callback.save_path = callback.save_path or Path(self.save_path)
+                if self.continue_training and callback.resume_from is None:
+                    callback.resume_from = Path(self.trained_agent).parent
+
+    @property
+    def its(self) -> ITSCallback | None:
+        """The interactive training strategy of this run, if it has one."""
+        found: list[BaseCallback] = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
+        return found[0] if found else None  # type: ignore[return-value]
+
+
+def check_keys(found: set[str], algorithm: type, where: str) -> None:
+    """
+    :param found: Keys of a YAML entry
+    :param algorithm: The class that gets what rl_zoo3 does not take
+    :param where: File and entry, named in the error
+    :raises ValueError: On a key that neither knows
+    """
+    known = ZOO_KEYS | set(inspect.signature(algorithm.__init__).parameters) - {"self", "_init_setup_model", "env"}
+    for key in sorted(found - known):
+        nearest = difflib.get_close_matches(key, known, n=1)
+        advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."
+        raise ValueError(f"{where}: unknown key {key!r}; {advice}")
+
+
+def parse_schedule(key: str, text: str) -> float | LinearSchedule:
+    """
+    :param key: Name of the hyperparameter
+    :param text: ``lin_X``, ``const_X`` or a number
+    :return: A linear decay from X to 0, or a number
+    :raises ValueError: If it is neither, or a schedule where SB3 takes none
+    """
+    kind, _, number = text.rpartition("_")
+    try:
+        value = float(number)
+    except ValueError:
+        raise ValueError(f"{key} is {text!r}; write a number, lin_X or const_X.") from None
+    if kind in ("", "const"):
+        return value
+    if kind != "lin" or key == "ent_coef":
+        raise ValueError(f"{key} is {text!r}; write a number{'' if key == 'ent_coef' else ', lin_X or const_X'}.")
+    return LinearSchedule(start=value, end=0.0, end_fraction=1.0)

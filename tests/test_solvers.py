@@ -1,0 +1,279 @@
+"""Solvers: what they return is feasible, follows from the seed, and is as good as it must be."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from conftest import instance_batches
+from hypothesis import given, settings
+
+from sb3_uav.envs import ClusteredGenerator, InstanceGenerator, Instances, UniformGenerator, check_schedule
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.solvers import DLDRL, SOLVERS, Solver, dl_drl, make_solver
+from sb3_uav.solvers.heuristics import KMeansNearest, kmeans
+
+TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
+
+
+def make_policy(policy_class: Any, n_uavs: int | None = None, **kwargs: Any) -> Any:
+    th.manual_seed(0)
+    policy = policy_class(*policy_class.placeholder_spaces(n_uavs), lambda _: 1e-3, **{**TINY, **kwargs})
+    policy.set_training_mode(False)
+    return policy
+
+
+def make_pair(n_uavs: int = 3, **kwargs: Any) -> DLDRL:
+    return DLDRL(make_policy(AllocatorPolicy, n_uavs), make_policy(RouterPolicy), **kwargs)
+
+
+def objectives(solver: Solver, instances: Instances, seed: int = 0) -> np.ndarray:
+    results = solver.solve(instances, seed)
+    assert len(results) == len(instances)
+    return np.array([check_schedule(instances, row, result.schedule).objective for row, result in enumerate(results)])
+
+
+def routes(solver: Solver, instances: Instances, seed: int = 0) -> list[tuple[tuple[int, ...], ...]]:
+    return [result.schedule.routes for result in solver.solve(instances, seed)]
+
+
+@pytest.fixture(scope="module")
+def instances() -> Instances:
+    return UniformGenerator(20, n_uavs=3)(9, np.random.default_rng(0))
+
+
+# ------------------------------------------------------------------------------------------------------------- all solvers
+
+
+@settings(max_examples=40)
+@given(instance_batches())
+def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
+    """Of any instance that is allowed; and as every task has a UAV, some task is visited if any can be reached."""
+    reachable = batch.reachable().any(1).tolist()
+    pair = make_pair(batch.n_uavs, decode="sampling", samples=3)
+    for solver in (*map(make_solver, SOLVERS), pair, make_pair(batch.n_uavs)):
+        objectives(solver, batch)
+        visited = [result.schedule.n_visited > 0 for result in solver.solve(batch)]
+        assert visited == reachable, solver.name
+
+
+@pytest.mark.parametrize("spec", sorted(SOLVERS))
+def test_the_seed_decides(spec: str, instances: Instances) -> None:
+    """Same seed, same schedules; the row of an instance, not the batch it comes in, decides what happens to it."""
+    solver = make_solver(spec)
+    assert routes(solver, instances, 3) == routes(solver, instances, 3)
+    assert routes(solver, instances[:4], 3) == routes(solver, instances, 3)[:4]
+    assert routes(make_solver("random-nearest"), instances, 3) != routes(make_solver("random-nearest"), instances, 4)
+
+
+def test_padding_changes_nothing(instances: Instances) -> None:
+    for solver in (*map(make_solver, SOLVERS), make_pair()):
+        assert routes(solver, instances.pad(31)) == routes(solver, instances), solver.name
+
+
+# -------------------------------------------------------------------------------------------------------------- heuristics
+
+
+def test_kmeans_finds_separate_clusters() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(4, size=60)
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])[truth] + rng.normal(0, 0.02, (60, 2))
+    labels = kmeans(points * 1e-150, 4, rng)
+    assert len({(a, b) for a, b in zip(truth.tolist(), labels.tolist(), strict=True)}) == 4
+    assert len(set(labels.tolist())) == 4
+
+
+@pytest.mark.parametrize("n_points, n_clusters", [(1, 1), (1, 4), (3, 5), (6, 2)])
+def test_kmeans_of_coincident_points(n_points: int, n_clusters: int) -> None:
+    labels = kmeans(np.full((n_points, 2), 0.3), n_clusters, np.random.default_rng(0))
+    assert set(labels.tolist()) == {0}
+
+
+def test_kmeans_gives_every_point_its_own_cluster_if_it_can() -> None:
+    points = np.random.default_rng(1).random((5, 2))
+    assert sorted(kmeans(points, 5, np.random.default_rng(0)).tolist()) == [0, 1, 2, 3, 4]
+
+
+def test_kmeans_centres_are_nearest() -> None:
+    """At the end no point is nearer to another cluster's centre, and more restarts never give a larger inertia."""
+    points = np.random.default_rng(2).random((80, 2))
+
+    def inertia(labels: np.ndarray) -> float:
+        return sum(np.square(points[labels == k] - points[labels == k].mean(0)).sum() for k in set(labels.tolist()))
+
+    few, many = kmeans(points, 6, np.random.default_rng(0), 1), kmeans(points, 6, np.random.default_rng(0), 30)
+    assert inertia(many) <= inertia(few)
+    centres = np.stack([points[many == k].mean(0) for k in range(6)])
+    np.testing.assert_array_equal(np.square(points[:, None] - centres).sum(-1).argmin(1), many)
+
+
+@pytest.mark.parametrize("generator", [UniformGenerator(80), ClusteredGenerator(80)])
+def test_kmeans_beats_a_random_split(generator: InstanceGenerator) -> None:
+    batch = generator(30, np.random.default_rng(5))
+    gain = objectives(make_solver("kmeans-nearest"), batch) - objectives(make_solver("random-nearest"), batch)
+    assert gain.mean() > 10 and (gain > 0).mean() > 0.9
+
+
+# ------------------------------------------------------------------------------------------------------------------ DL-DRL
+
+
+def test_greedy_is_the_policies_own_plan(instances: Instances) -> None:
+    """The solver does what allocator and router do by hand, whatever the batch."""
+    pair = make_pair()
+    found = routes(pair, instances)
+    for row, schedule in enumerate(found):
+        assignment = pair.allocator.decode_episodes(instances[row])[0, 0].tolist()
+        assert len(schedule) == 3
+        for uav, route in enumerate(schedule):
+            mine = [task for task, owner in enumerate(assignment) if owner == uav]
+            assert set(route) <= set(mine)
+            if mine:
+                subset = Instances.from_arrays(instances.depot[row], instances.tasks[row, mine])
+                tour = [mine[node - 1] for node in pair.router.plan(subset)[0].tolist() if node > 0]
+                assert list(route) == tour
+
+
+@pytest.mark.parametrize("batch_size", [1, 4, 100])
+@pytest.mark.parametrize("decode", dl_drl.DECODINGS)
+def test_batch_size_changes_only_the_timing(decode: str, batch_size: int, instances: Instances) -> None:
+    pair = make_pair(decode=decode, samples=5)
+    batched = make_pair(decode=decode, samples=5, batch_size=batch_size)
+    results = batched.solve(instances, 2)
+    assert [result.schedule for result in results] == [result.schedule for result in pair.solve(instances, 2)]
+    sizes = {1: [1] * 9, 4: [4] * 8 + [1], 100: [9] * 9}[batch_size]
+    assert [result.batch_size for result in results] == sizes
+    assert all(result.seconds > 0 for result in results)
+
+
+def test_memory_bounds_the_batch(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With hardly any memory, instances are solved one by one, and nothing else changes."""
+    pair = make_pair(decode="sampling", samples=3)
+    roomy = pair.solve(instances, 0)
+    monkeypatch.setattr(dl_drl, "CPU_MEMORY", 1)
+    tight = pair.solve(instances, 0)
+    assert [result.batch_size for result in tight] == [1] * 9
+    assert [result.schedule for result in tight] == [result.schedule for result in roomy]
+    monkeypatch.undo()
+    router = make_policy(RouterPolicy, embed_dim=128, n_heads=8)
+    assert 1 <= dl_drl.rows_that_fit(router, 1501) < dl_drl.rows_that_fit(router, 81) < 10_000
+
+
+def test_more_samples_are_never_worse(instances: Instances) -> None:
+    """Fewer samples are a part of more samples, so the best of them can only grow."""
+    samples = (1, 2, 10, dl_drl.SAMPLE_BLOCK, dl_drl.SAMPLE_BLOCK + 1, 150)
+    best = np.stack([objectives(make_pair(decode="sampling", samples=n), instances, 7) for n in samples])
+    assert (np.diff(best, axis=0) >= 0).all()
+    assert best[-1].sum() > best[0].sum()
+
+
+def test_sampling_follows_the_seed(instances: Instances) -> None:
+    pair = make_pair(decode="sampling", samples=2)
+    th.manual_seed(1)
+    first = routes(pair, instances, 5)
+    th.manual_seed(2)
+    assert first == routes(pair, instances, 5)
+    assert first != routes(pair, instances, 6)
+
+
+def test_untrained_networks(instances: Instances) -> None:
+    """Same architecture, other parameters, which follow from the seed alone; the global random state is not touched."""
+    pair = make_pair(decode="sampling", samples=4)
+    state = th.get_rng_state()
+    fresh, again, other = pair.untrained(1), pair.untrained(1), pair.untrained(2)
+    assert th.equal(state, th.get_rng_state())
+    assert fresh.name == "DL-DRL untrained (sampling 4)" and pair.name == "DL-DRL (sampling 4)"
+    for level in ("allocator", "router"):
+        trained = getattr(pair, level).state_dict()
+        initial = getattr(fresh, level).state_dict()
+        assert {name: value.shape for name, value in trained.items()} == {name: v.shape for name, v in initial.items()}
+        name = "features_extractor.encoder.embed_depot.weight"
+        assert not th.equal(trained[name], initial[name])
+        assert th.equal(initial[name], getattr(again, level).state_dict()[name])
+        assert not th.equal(initial[name], getattr(other, level).state_dict()[name])
+    assert objectives(fresh, instances).min() > 0
+
+
+def test_untrained_keeps_every_setting() -> None:
+    pair = DLDRL(
+        make_policy(AllocatorPolicy, 5, preset="paper", net_arch=[4], activation_fn=th.nn.ReLU), make_policy(RouterPolicy)
+    )
+    fresh = pair.untrained()
+    assert str(fresh.allocator) == str(pair.allocator) and fresh.allocator.n_uavs == 5
+    assert fresh.name == "DL-DRL untrained (greedy)"
+
+
+def test_policies_left_in_training_mode(instances: Instances) -> None:
+    """BatchNorm must not see the instances that are evaluated."""
+    pair = DLDRL(make_policy(AllocatorPolicy, 3, preset="paper"), make_policy(RouterPolicy, preset="paper"))
+    before = {name: buffer.clone() for name, buffer in pair.allocator.named_buffers()}
+    assert len(before) > 0
+    expected = routes(pair, instances)
+    pair.allocator.set_training_mode(True)
+    pair.router.set_training_mode(True)
+    assert routes(pair, instances) == expected
+    assert all(th.equal(before[name], buffer) for name, buffer in pair.allocator.named_buffers())
+
+
+def test_wrong_fleet(instances: Instances) -> None:
+    with pytest.raises(ValueError, match="trained for 4 UAVs, the instances have 3; use an allocator trained for 3"):
+        make_pair(4).solve(instances)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(decode="beam"), "decode is 'beam'; choose one of"),
+        (dict(decode="sampling", samples=0), "samples is 0; give at least 1"),
+        (dict(batch_size=0), "batch_size is 0; give at least 1"),
+    ],
+)
+def test_arguments_of_dl_drl(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_pair(**kwargs)
+
+
+# ---------------------------------------------------------------------------------------------------------------- registry
+
+
+def test_options() -> None:
+    solver = make_solver("kmeans-nearest:restarts=3")
+    assert isinstance(solver, KMeansNearest) and solver.restarts == 3
+    assert solver.name == "kmeans-nearest:restarts=3"
+    assert make_solver("kmeans-nearest").name == "kmeans-nearest"
+
+
+@pytest.mark.parametrize(
+    "spec, message",
+    [
+        ("kmeans", r"Unknown solver 'kmeans'; choose one of \['kmeans-nearest', 'random-nearest'"),
+        ("kmeans-nearest:k=3", r"has no option 'k=3'; its options are: restarts=<int>"),
+        ("kmeans-nearest:restarts", r"has no option 'restarts'"),
+        ("random-nearest:restarts=2", r"has no option 'restarts=2'; its options are: none"),
+        ("kmeans-nearest:restarts=two", r"'restarts=two' of solver 'kmeans-nearest' must be of type int"),
+        ("kmeans-nearest:restarts=__import__('os')", "must be of type int"),
+        ("kmeans-nearest:restarts=1,restarts=2", "given the option 'restarts' twice"),
+        ("kmeans-nearest:restarts=0", "at least 1 start"),
+    ],
+)
+def test_wrong_options(spec: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_solver(spec)
+
+
+class Typed:
+    """A solver with an option of every type."""
+
+    def __init__(self, number: float = 1.0, flag: bool = False, text: str = "") -> None:
+        self.options = dict(number=number, flag=flag, text=text)
+
+
+def test_typed_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SOLVERS, "typed", f"{__name__}:Typed")
+    assert json.dumps(make_solver("typed:number=1e-3,flag=true,text=a=b").options) == json.dumps(
+        dict(number=1e-3, flag=True, text="a=b")
+    )
+    with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false"):
+        make_solver("typed:flag=yes")

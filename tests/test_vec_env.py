@@ -1,0 +1,588 @@
+"""``BatchedVecEnv``, against SB3's ``DummyVecEnv`` and in SB3's hands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import instance_batches, random_legal, seeds
+from gymnasium.error import ResetNeeded
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformReward
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor, load_results
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+
+from sb3_uav.envs import (
+    BatchedVecEnv,
+    FixedGenerator,
+    Instances,
+    RoutePlanningEnv,
+    TaskAllocationEnv,
+    UniformGenerator,
+    nearest_feasible,
+)
+from sb3_uav.envs.gym_env import ProblemEnv
+
+LEVELS: dict[str, type[ProblemEnv]] = {"routing": RoutePlanningEnv, "allocation": TaskAllocationEnv}
+both_levels = pytest.mark.parametrize("level", sorted(LEVELS))
+
+
+def env_fns(level: str, n_envs: int, **kwargs: Any) -> list[Callable[[], gym.Env]]:
+    return [lambda: Monitor(LEVELS[level](**kwargs)) for _ in range(n_envs)]
+
+
+def batched_env(level: str, n_envs: int, **kwargs: Any) -> BatchedVecEnv:
+    return BatchedVecEnv(env_fns(level, n_envs, **kwargs))
+
+
+def masks_of(env: VecEnv) -> np.ndarray:
+    return np.stack(env.env_method("action_masks"))
+
+
+def legal_actions(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
+    return random_legal(th.from_numpy(masks_of(env)), rng).numpy()
+
+
+def assert_same_arrays(a: Any, b: Any) -> None:
+    """Two Dict observations, keys in the same order, dtypes and values."""
+    assert list(a) == list(b)
+    for key in a:
+        assert a[key].dtype == b[key].dtype and np.array_equal(a[key], b[key]), key
+
+
+def assert_same_infos(a: dict[str, Any], b: dict[str, Any]) -> None:
+    """Everything but the clock."""
+    assert set(a) - {"TimeLimit.truncated"} == set(b) - {"TimeLimit.truncated"}
+    assert a.get("TimeLimit.truncated", False) == b.get("TimeLimit.truncated", False)
+    assert a["illegal_actions"] == b["illegal_actions"]
+    assert a.get("objective") == b.get("objective")
+    if "episode" in a:
+        assert {**a["episode"], "t": 0} == {**b["episode"], "t": 0} and a["episode"]["t"] >= 0
+        assert_same_arrays(a["terminal_observation"], b["terminal_observation"])
+
+
+def assert_same_run(ours: VecEnv, theirs: VecEnv, rng: np.random.Generator, n_steps: int, recklessness: float) -> int:
+    """
+    Step both alike and compare everything they return.
+
+    :return: How many episodes ended
+    """
+    n_episodes = 0
+    for _ in range(n_steps):
+        assert np.array_equal(masks_of(ours), masks_of(theirs))
+        actions = legal_actions(theirs, rng)
+        careless = rng.random(len(actions)) < recklessness
+        actions[careless] = rng.integers(0, masks_of(ours).shape[1], careless.sum())
+        (obs_a, rewards_a, dones_a, infos_a), (obs_b, rewards_b, dones_b, infos_b) = ours.step(actions), theirs.step(actions)
+        assert_same_arrays(obs_a, obs_b)
+        for a, b in ((rewards_a, rewards_b), (dones_a, dones_b)):
+            assert a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b)
+        for info_a, info_b, done in zip(infos_a, infos_b, dones_a, strict=True):
+            assert_same_infos(info_a, info_b)
+            assert ("episode" in info_a) == done
+        n_episodes += dones_a.sum()
+    return int(n_episodes)
+
+
+# The same as DummyVecEnv
+
+
+@both_levels
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**31),
+    n_envs=st.integers(1, 5),
+    n_tasks=st.integers(1, 7),
+    max_distance=st.sampled_from([0.05, 1.0, 2.0]),
+    distribution=st.sampled_from(["uniform", "clustered"]),
+    recklessness=st.sampled_from([0.0, 0.2]),
+)
+def test_plays_the_episodes_of_dummy_vec_env(
+    level: str, seed: int, n_envs: int, n_tasks: int, max_distance: float, distribution: str, recklessness: float
+) -> None:
+    """Seeded alike, step by step, over several episodes of unequal lengths, with illegal actions or without."""
+    fns = env_fns(level, n_envs, n_tasks=n_tasks, max_distance=max_distance, distribution=distribution)
+    ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
+    assert ours.seed(seed) == theirs.seed(seed)
+    assert_same_arrays(ours.reset(), theirs.reset())
+    rng = np.random.default_rng(seed)
+    assert assert_same_run(ours, theirs, rng, 3 * n_tasks + 3, recklessness) >= 3 * n_envs
+    # A reset in the middle of episodes goes on with the same random numbers.
+    assert_same_arrays(ours.reset(), theirs.reset())
+    assert_same_run(ours, theirs, rng, n_tasks, recklessness)
+    assert ours.reset_infos == theirs.reset_infos
+    assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
+
+
+@both_levels
+@settings(max_examples=25)
+@given(instances=instance_batches(), seed=seeds, n_envs=st.integers(1, 4))
+def test_plays_given_instances_like_dummy_vec_env(level: str, instances: Instances, seed: int, n_envs: int) -> None:
+    """Instances of every kind, padded ones too, whose episodes end at different times."""
+    fns = env_fns(level, n_envs, instances=instances)
+    ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
+    ours.seed(seed)
+    theirs.seed(seed)
+    assert_same_arrays(ours.reset(), theirs.reset())
+    assert_same_run(ours, theirs, np.random.default_rng(seed), 2 * instances.n_tasks + 2, 0.1)
+
+
+@both_levels
+@settings(max_examples=15)
+@given(instances=instance_batches(uniform_size=True), seed=st.integers(0, 1000), n_envs=st.integers(2, 4))
+def test_options_and_seeds_are_used_once(level: str, instances: Instances, seed: int, n_envs: int) -> None:
+    """Row by row, at the next reset only."""
+    fns = (
+        env_fns(level, n_envs, n_tasks=10, n_uavs=instances.n_uavs)
+        if level == "allocation"
+        else env_fns(level, n_envs, n_tasks=10)
+    )
+    ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
+    options = [{"instance": instances[row % len(instances)]} if row != 1 else {} for row in range(n_envs)]
+    for env in (ours, theirs):
+        env.seed(seed)
+        env.set_options(options)
+    first = ours.reset()
+    assert_same_arrays(first, theirs.reset())
+    n_tasks = instances.n_tasks
+    assert first["task_mask"].sum(1).tolist() == [n_tasks if row != 1 else 10 for row in range(n_envs)]
+    assert np.array_equal(first["tasks"][0, : 2 * n_tasks], instances.tasks[0].float().flatten().numpy())
+    assert_same_run(ours, theirs, np.random.default_rng(seed), n_tasks + 2, 0.0)
+    again = ours.reset()
+    assert_same_arrays(again, theirs.reset())
+    assert again["task_mask"].all()
+    # One dict is for all rows.
+    ours.set_options({"instance": instances[0]})
+    assert (ours.reset()["task_mask"].sum(1) == n_tasks).all()
+
+
+@both_levels
+def test_bad_options_are_refused(level: str) -> None:
+    env = batched_env(level, 2, n_tasks=4)
+    for options, message in [
+        ([{}, {"instances": None}], r"Unknown reset options \['instances'\]"),
+        ([{"instance": UniformGenerator(4)(2, np.random.default_rng(0))}, {}], "must be Instances with batch size 1"),
+        ([{"instance": UniformGenerator(5)(1, np.random.default_rng(0))}, {}], "The instance has 5 tasks, but .* holds 4"),
+    ]:
+        env.set_options(options)
+        with pytest.raises(ValueError, match=message):
+            env.reset()
+
+
+def test_fleet_of_a_given_instance() -> None:
+    """Allocation refuses another number of UAVs than its actions have; the router does not care, in any row."""
+    other_fleet = {"instance": UniformGenerator(4, n_uavs=6)(1, np.random.default_rng(0))}
+    allocation, routing = batched_env("allocation", 2, n_tasks=4), batched_env("routing", 2, n_tasks=4)
+    for env in (allocation, routing):
+        env.set_options([{}, other_fleet])
+    with pytest.raises(ValueError, match="The instance has 6 UAVs, but the environment was made for 4"):
+        allocation.reset()
+    expected = other_fleet["instance"].tasks.float().numpy().ravel()
+    assert np.array_equal(routing.reset()["tasks"][1], expected)
+
+
+@both_levels
+def test_rows_and_seeds(level: str) -> None:
+    """Row i plays what a single environment seeded with seed + i plays; unseeded rows all differ."""
+    env = batched_env(level, 3, n_tasks=5)
+    env.seed(20)
+    tasks = env.reset()["tasks"]
+    for row in range(3):
+        assert np.array_equal(LEVELS[level](n_tasks=5).reset(seed=20 + row)[0]["tasks"], tasks[row])
+    unseeded = np.concatenate([batched_env(level, 3, n_tasks=5).reset()["tasks"] for _ in range(2)])
+    assert len(np.unique(unseeded, axis=0)) == 6
+
+
+@both_levels
+def test_nothing_returned_shares_memory(level: str) -> None:
+    """Overwriting everything that is handed out changes neither the episodes nor what is returned next."""
+    runs = []
+    for vandal in (False, True):
+        env = batched_env(level, 3, n_tasks=4)
+        env.seed(0)
+        observation = env.reset()
+        rng = np.random.default_rng(0)
+        run = []
+        for _ in range(10):
+            actions = legal_actions(env, rng)
+            masks = env.action_masks()
+            if vandal:
+                masks[:] = False
+                for array in observation.values():  # type: ignore[union-attr]
+                    array[...] = 1
+            before = {key: array.copy() for key, array in observation.items()}  # type: ignore[union-attr]
+            new, rewards, dones, infos = env.step(actions)
+            assert_same_arrays(observation, before)
+            run.append([{key: array.tolist() for key, array in new.items()}, rewards.tolist(), dones.tolist()])  # type: ignore[union-attr]
+            for info in infos:
+                if "terminal_observation" in info:
+                    run.append([{key: array.tolist() for key, array in info["terminal_observation"].items()}])
+                    if vandal:
+                        for array in info["terminal_observation"].values():
+                            array[...] = 1
+            if vandal:
+                rewards[:], dones[:] = 9, True
+            observation = new
+        runs.append(run)
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("actions", [[0, 4], [0, -1], [0, 0.5], [0, np.nan], [0], [0, 0, 0]])
+def test_impossible_actions_are_refused(actions: list[float]) -> None:
+    env = batched_env("allocation", 2, n_tasks=3, n_uavs=4)
+    env.reset()
+    with pytest.raises(ValueError, match="Give 2 whole numbers between 0 and 3 as actions; found"):
+        env.step(np.array(actions))
+
+
+@both_levels
+def test_step_before_reset(level: str) -> None:
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        batched_env(level, 2).step(np.array([0, 0]))
+
+
+@both_levels
+def test_thousands_of_rows(level: str) -> None:
+    """2048 rows play whole episodes; row 1000 as it plays alone."""
+    env = batched_env(level, 2048, n_tasks=20)
+    env.seed(0)
+    observation = env.reset()
+    assert observation["tasks"].shape == (2048, 40) and len(np.unique(observation["tasks"], axis=0)) == 2048
+    rng = np.random.default_rng(0)
+    alone = LEVELS[level](n_tasks=20)
+    alone.reset(seed=1000)
+    n_episodes, alone_is_over = 0, False
+    for _ in range(21):
+        actions = random_legal(th.from_numpy(env.action_masks()), rng).numpy()
+        if not alone_is_over:
+            single, _, alone_is_over, _, _ = alone.step(actions[1000])
+        observation, _, dones, infos = env.step(actions)
+        seen = infos[1000]["terminal_observation"] if dones[1000] else {key: array[1000] for key, array in observation.items()}  # type: ignore[union-attr]
+        if n_episodes == 0 or alone_is_over == dones[1000]:
+            assert_same_arrays(seen, single)
+        if alone_is_over:
+            assert dones[1000]
+            alone_is_over = False
+            alone.reset()
+        n_episodes += int(dones.sum())
+    assert n_episodes >= 2048
+
+
+# What it accepts
+
+
+class Halved(TransformReward):
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env, lambda reward: float(reward) / 2)
+
+
+class Shaped(RoutePlanningEnv):
+    """Overrides what the batch would not call."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = super().step(action)
+        return observation, reward - 1.0, *rest
+
+
+class Sly(Monitor):
+    """Is a Monitor, but not only."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = super().step(action)
+        return observation, float(reward) / 2, *rest
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        partial(gym.make, "CartPole-v1"),
+        lambda: Halved(RoutePlanningEnv()),
+        lambda: Monitor(Halved(RoutePlanningEnv())),
+        Shaped,
+        lambda: Monitor(Shaped()),
+        lambda: Sly(RoutePlanningEnv()),
+    ],
+    ids=["foreign", "wrapped", "wrapped inside", "subclass", "subclass inside", "subclass of Monitor"],
+)
+def test_refuses_what_it_would_not_play(make: Callable[[], gym.Env]) -> None:
+    """Foreign environments, and everything that changes what one of ours does."""
+    with pytest.raises(ValueError, match=r"BatchedVecEnv cannot batch <.*; use stable_baselines3's DummyVecEnv for it"):
+        BatchedVecEnv([make])
+
+
+def test_accepts_transparent_wrappers() -> None:
+    """What ``gym.make`` and ``make_vec_env`` put around an environment."""
+    env = gym.make("RoutePlanning-N20-v0")
+    assert {type(env), type(env.env), type(env.env.env)} == {TimeLimit, OrderEnforcing, PassiveEnvChecker}  # type: ignore[attr-defined]
+    assert BatchedVecEnv([lambda: Monitor(env)]).template is env.unwrapped
+    made = make_vec_env("TaskAllocation-U3-N20-v0", n_envs=2, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
+    assert isinstance(made, BatchedVecEnv) and made.reset()["tasks"].shape == (2, 40)  # type: ignore[call-overload]
+
+
+# Attributes and methods
+
+
+@both_levels
+def test_attributes_are_those_of_one_shared_environment(level: str) -> None:
+    env = batched_env(level, 3, n_tasks=4, render_mode="rgb_array")
+    env.reset()
+    assert env.get_attr("render_mode") == ["rgb_array"] * 3 and env.render_mode == "rgb_array"
+    assert len(env.get_attr("problem", indices=[0, 2])) == 2 and len(env.get_attr("problem", indices=1)) == 1
+    assert env.has_attr("problem") and not env.has_attr("wings")
+    with pytest.raises(AttributeError, match="wings"):
+        env.get_attr("wings")
+    env.set_attr("wings", 4)
+    assert env.get_attr("wings") == [4, 4, 4]
+    env.set_attr("wings", 6, indices=[2, 0, 1])
+    assert env.has_attr("wings") and env.get_attr("wings", indices=-1) == [6]
+    with pytest.raises(ValueError, match=r"Cannot set wings for rows \[0, 1\] alone: the rows .* share one environment"):
+        env.set_attr("wings", 8, indices=[0, 1])
+    assert env.get_attr("wings", indices=0) == [6]
+
+
+@both_levels
+def test_instances_are_those_of_the_rows(level: str) -> None:
+    env = batched_env(level, 3, n_tasks=4)
+    assert not env.has_attr("instance")
+    observation = env.reset()
+    for row, instance in zip([2, 0], env.get_attr("instance", indices=[2, 0]), strict=True):
+        assert len(instance) == 1 and np.array_equal(instance.tasks.float().flatten(), observation["tasks"][row])
+    assert env.has_attr("instance") and len(env.get_attr("instance")) == 3
+
+
+@both_levels
+def test_methods(level: str) -> None:
+    """``action_masks`` answers by row; what the rows share is called once, for all of them or not at all."""
+    env = batched_env(level, 3, n_tasks=4)
+    env.reset()
+    masks = env.action_masks()
+    assert np.array_equal(np.stack(env.env_method("action_masks", indices=[2, 0])), masks[[2, 0]])
+    assert env.env_method("action_masks", indices=1)[0].tolist() == masks[1].tolist()
+    assert [mask.tolist() for mask in env.env_method("action_masks")] == masks.tolist()
+    with pytest.raises(ValueError, match="Cannot call set_generator for rows 0 alone: the rows .* share one environment"):
+        env.env_method("set_generator", UniformGenerator(4), indices=0)
+    for name in ("reset", "step"):
+        with pytest.raises(ValueError, match=rf"The rows of a BatchedVecEnv share one environment; call its own {name}\(\)"):
+            env.env_method(name)
+    with pytest.raises(AttributeError, match="flap"):
+        env.env_method("flap")
+
+
+@pytest.mark.parametrize("by_method", [True, False])
+@both_levels
+def test_set_generator(level: str, by_method: bool) -> None:
+    """For all rows, from their next episode on."""
+    env = batched_env(level, 3, n_tasks=4)
+    first = env.reset()
+    source = FixedGenerator(UniformGenerator(4, 1 if level == "routing" else 4)(1, np.random.default_rng(0)))
+    if by_method:
+        env.env_method("set_generator", source)
+    else:
+        env.set_generator(source)
+    assert np.array_equal(env.get_attr("instance")[0].tasks.float().flatten(), first["tasks"][0])
+    assert (env.reset()["tasks"] == source.instances.tasks.float().flatten().numpy()).all()
+    with pytest.raises(ValueError, match="The new generator draws 5 tasks"):
+        env.set_generator(UniformGenerator(5))
+
+
+def test_set_router() -> None:
+    """By ``env_method``, as a training callback hands the router over; in all rows and in running episodes."""
+    env = batched_env("allocation", 3, n_tasks=2)
+
+    def final_rewards() -> list[float]:
+        env.step(np.zeros(3, dtype=np.int64))
+        return env.step(np.zeros(3, dtype=np.int64))[1].tolist()
+
+    env.seed(0)
+    env.reset()
+    assert sum(final_rewards()) > 0
+    env.env_method("set_router", lambda instances: th.zeros(len(instances), 1, dtype=th.int64))
+    assert final_rewards() == [0.0, 0.0, 0.0]
+    env.env_method("set_router", nearest_feasible)
+    assert sum(final_rewards()) > 0
+
+
+def test_env_is_wrapped() -> None:
+    """In a Monitor, as far as SB3 wants to know: its statistics are in the infos."""
+
+    class OtherMonitor(Monitor):
+        pass
+
+    env = batched_env("routing", 3)
+    assert env.env_is_wrapped(Monitor) == [True] * 3 and env.env_is_wrapped(Monitor, indices=[1]) == [True]
+    assert env.env_is_wrapped(TransformReward) == [False] * 3 and env.env_is_wrapped(OtherMonitor) == [False] * 3
+
+
+# In SB3's hands
+
+
+def run_random(env: VecEnv, n_steps: int) -> list[list[dict[str, float]]]:
+    """The episode infos of each row."""
+    rng = np.random.default_rng(0)
+    episodes: list[list[dict[str, float]]] = [[] for _ in range(env.num_envs)]
+    env.reset()
+    for _ in range(n_steps):
+        infos = env.step(legal_actions(env, rng))[3]
+        for row, info in enumerate(infos):
+            if "episode" in info:
+                episodes[row].append(info["episode"])
+    return episodes
+
+
+@pytest.mark.parametrize("env_id", ["RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"])
+def test_monitor_file_holds_the_episodes_of_row_0(env_id: str, tmp_path: Path) -> None:
+    env = make_vec_env(
+        env_id,
+        n_envs=3,
+        seed=0,
+        monitor_dir=str(tmp_path),
+        vec_env_cls=BatchedVecEnv,  # type: ignore[arg-type]
+        monitor_kwargs={"info_keywords": ("objective", "illegal_actions")},
+    )
+    episodes = run_random(env, 70)
+    env.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["0.monitor.csv"]
+    results = load_results(str(tmp_path))
+    assert len(episodes[0]) >= 3 and len(results) == len(episodes[0])
+    for column in ("r", "l", "objective", "illegal_actions"):
+        assert results[column].tolist() == pytest.approx([episode[column] for episode in episodes[0]])
+    assert results["t"].is_monotonic_increasing
+
+
+@both_levels
+def test_vec_monitor(level: str, tmp_path: Path) -> None:
+    """Counts the same returns and lengths as the environment itself."""
+    inner = batched_env(level, 3, n_tasks=4)
+    inner.seed(0)
+    own = run_random(inner, 20)
+    inner.seed(0)
+    with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
+        env = VecMonitor(inner, str(tmp_path / "all"))
+    outer = run_random(env, 20)
+    env.close()
+    for row in range(3):
+        assert [(e["r"], e["l"]) for e in own[row]] == [(pytest.approx(e["r"]), e["l"]) for e in outer[row]]
+    assert len(load_results(str(tmp_path))) == sum(len(row) for row in own)
+
+
+@both_levels
+def test_vec_normalize(level: str) -> None:
+    """Rewards normalized, observations left alone, and the originals at hand."""
+    plain, inner = batched_env(level, 3, n_tasks=4), batched_env(level, 3, n_tasks=4)
+    env = VecNormalize(inner, norm_obs=False)
+    plain.seed(0)
+    env.seed(0)
+    assert_same_arrays(env.reset(), plain.reset())
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        actions = legal_actions(plain, rng)
+        expected, rewards, dones, _ = plain.step(actions)
+        observation, normalized, their_dones, _ = env.step(actions)
+        assert_same_arrays(observation, expected)
+        assert np.array_equal(env.get_original_reward(), rewards) and np.array_equal(dones, their_dones)
+        assert (np.sign(normalized) == np.sign(rewards)).all()
+    assert np.isfinite(normalized).all() and env.ret_rms.var > 0
+
+
+class RandomPolicy:
+    """Any legal action, as observed."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, None]:
+        return random_legal(th.from_numpy(observation["action_mask"].astype(bool)), self.rng).numpy(), None
+
+
+@both_levels
+def test_evaluate_policy(level: str) -> None:
+    """SB3's evaluation gives the same episodes on our VecEnv and on SB3's, and no illegal action."""
+    fns = env_fns(level, 2, n_tasks=5)
+    results, illegal = [], []
+
+    def look(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
+        illegal.append(local_variables["info"]["illegal_actions"])
+
+    for env in (BatchedVecEnv(fns), DummyVecEnv(fns)):
+        env.seed(3)
+        results.append(evaluate_policy(RandomPolicy(), env, n_eval_episodes=7, return_episode_rewards=True, callback=look))  # type: ignore[arg-type]
+    rewards, lengths = results[0]
+    assert results[0] == results[1] and len(rewards) == 7  # type: ignore[arg-type]
+    assert all(0 <= reward <= 5 for reward in rewards) and all(1 <= length <= 6 for length in lengths)  # type: ignore[union-attr]
+    assert len(illegal) > 0 and set(illegal) == {0}
+
+
+@both_levels
+def test_stock_ppo_learns_the_same(level: str) -> None:
+    """SB3's PPO with SB3's policy: a few updates on our VecEnv and on SB3's end with equal parameters."""
+    models = []
+    for vec_env_cls in (BatchedVecEnv, DummyVecEnv):
+        env = vec_env_cls(env_fns(level, 4, n_tasks=5))
+        model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=16, n_epochs=1, seed=0, policy_kwargs={"net_arch": [8]})
+        before = {name: parameter.clone() for name, parameter in model.policy.state_dict().items()}
+        model.learn(64)
+        assert model.num_timesteps == 64 and len(model.ep_info_buffer) > 0  # type: ignore[arg-type]
+        assert any(not th.equal(before[name], parameter) for name, parameter in model.policy.state_dict().items())
+        models.append(model)
+    ours, theirs = (model.policy.state_dict() for model in models)
+    assert all(th.equal(ours[name], theirs[name]) for name in ours)
+
+
+# Rendering
+
+
+@both_levels
+def test_images(level: str) -> None:
+    """One per row, as the single environment draws it; tiled by ``render``."""
+    fns = env_fns(level, 2, n_tasks=4, render_mode="rgb_array")
+    ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
+    assert ours.metadata == {"render_modes": ["human", "rgb_array"]}
+    for env in (ours, theirs):
+        env.seed(0)
+        env.reset()
+    actions = legal_actions(ours, np.random.default_rng(0))
+    for env in (ours, theirs):
+        env.step(actions)
+    images = ours.get_images()
+    assert len(images) == 2 and not np.array_equal(images[0], images[1])  # type: ignore[arg-type]
+    for image, expected in zip(images, theirs.get_images(), strict=True):
+        assert image is not None and image.dtype == np.uint8 and np.array_equal(image, expected)  # type: ignore[arg-type]
+    big = ours.render()
+    assert big is not None and np.array_equal(big, theirs.render())  # type: ignore[arg-type]
+    (second,) = ours.env_method("render", indices=1)
+    assert np.array_equal(second, images[1])  # type: ignore[arg-type]
+    ours.close()
+
+
+@both_levels
+def test_no_images_without_a_render_mode(level: str) -> None:
+    env = batched_env(level, 2, n_tasks=4)
+    env.reset()
+    assert list(env.get_images()) == [None, None]
+    with pytest.warns(UserWarning, match="no `render_mode` was passed"):
+        assert env.render() is None
+
+
+def test_human_mode_without_a_display() -> None:
+    """Does not crash, and leaves no figure behind."""
+    import matplotlib.pyplot as plt
+
+    env = batched_env("routing", 2, n_tasks=4, render_mode="human")
+    env.reset()
+    assert env.render() is None
+    env.step(legal_actions(env, np.random.default_rng(0)))
+    assert env.render() is None
+    env.close()
+    assert plt.get_fignums() == []
