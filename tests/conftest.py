@@ -111,7 +111,8 @@ def play_randomly(
     :return: Actions ``(batch, n_samples, n_steps)`` int64, and the reward of each, float64
     """
     state = dynamics.reset(n_samples)
-    actions, rewards = [], []
+    actions: list[th.Tensor] = []
+    rewards: list[th.Tensor] = []
     while len(actions) < min_steps or not state.done.all():
         chosen = random_legal(state.action_mask, generator)
         state, reward = dynamics.step(state, chosen)

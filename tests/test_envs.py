@@ -25,6 +25,7 @@ import sb3_uav
 from sb3_uav.envs import (
     ClusteredGenerator,
     FixedGenerator,
+    InstanceGenerator,
     Instances,
     RoutePlanningEnv,
     Schedule,
@@ -65,37 +66,44 @@ def play(env: ProblemEnv, rng: np.random.Generator, **reset_kwargs: Any) -> tupl
             return observations, rewards
 
 
+def rendered(env: ProblemEnv) -> np.ndarray:
+    image = env.render()
+    assert image is not None
+    return image
+
+
 # Registration
 
 
 def test_every_scenario_of_the_paper_is_registered() -> None:
     for n_tasks in PAPER_SIZES:
-        routing = gym.spec(f"RoutePlanning-N{n_tasks}-v0")
-        assert routing.kwargs == {"n_tasks": n_tasks}
+        routing = gym.spec(f"RoutePlanning-N{n_tasks}-v0").make().unwrapped
+        assert isinstance(routing, RoutePlanningEnv) and routing.problem.generator == UniformGenerator(n_tasks, 1, 2.0)
         for n_uavs in (4, 6):
-            allocation = gym.spec(f"TaskAllocation-U{n_uavs}-N{n_tasks}-v0")
-            assert allocation.kwargs == {"n_tasks": n_tasks, "n_uavs": n_uavs}
+            allocation = gym.spec(f"TaskAllocation-U{n_uavs}-N{n_tasks}-v0").make().unwrapped
+            assert isinstance(allocation, TaskAllocationEnv)
+            assert allocation.problem.generator == UniformGenerator(n_tasks, n_uavs, 2.0)
 
 
 @pytest.mark.parametrize(
-    ("env_id", "n_tasks", "n_actions"),
+    ("env_id", "n_tasks", "n_actions", "max_distance"),
     [
-        ("TaskAllocation-U3-N20-v0", 20, 3),
-        ("TaskAllocation-U4-N80-v0", 80, 4),
-        ("TaskAllocation-U6-N500-v0", 500, 6),
-        ("RoutePlanning-N20-v0", 20, 21),
-        ("RoutePlanning-N300-v0", 300, 301),
+        ("TaskAllocation-U3-N20-v0", 20, 3, 1.5),
+        ("TaskAllocation-U4-N80-v0", 80, 4, 2.0),
+        ("TaskAllocation-U6-N500-v0", 500, 6, 2.0),
+        ("RoutePlanning-N20-v0", 20, 21, 1.5),
+        ("RoutePlanning-N300-v0", 300, 301, 2.0),
     ],
 )
-def test_ids_make_what_they_say(env_id: str, n_tasks: int, n_actions: int) -> None:
-    """The benchmark's instances: D = 2, unit square, unit values."""
+def test_ids_make_what_they_say(env_id: str, n_tasks: int, n_actions: int, max_distance: float) -> None:
+    """The benchmark's instances: D = 2 (less in the demo), unit square, unit values."""
     env = gym.make(env_id)
     assert isinstance(env.action_space, gym.spaces.Discrete) and env.action_space.n == n_actions
     env.reset(seed=0)
     problem_env = env.unwrapped
     assert isinstance(problem_env, ProblemEnv)
     instance = problem_env.instance
-    assert instance.n_tasks == n_tasks and instance.max_distance.tolist() == [2.0]
+    assert instance.n_tasks == n_tasks and instance.max_distance.tolist() == [max_distance]
     assert (instance.values == 1).all() and instance.tasks.min() >= 0 and instance.tasks.max() <= 1
 
 
@@ -256,18 +264,19 @@ def test_sizes_and_distance(level: str) -> None:
     observation, _ = env.reset(seed=0)
     assert observation["tasks"].shape == (6,) and observation["max_distance"] == 0.5
     assert env.action_space.n == 4  # type: ignore[attr-defined]
-    assert TaskAllocationEnv(n_uavs=7).action_space.n == 7
+    assert TaskAllocationEnv(n_uavs=7).action_space.n == 7  # type: ignore[attr-defined]
 
 
 @both_levels
 def test_distributions(level: str) -> None:
     """Each environment draws what its generator draws from the same random numbers."""
     n_uavs = 1 if level == "routing" else 4
-    for kwargs, generator in [
+    cases: list[tuple[dict[str, Any], InstanceGenerator]] = [
         ({}, UniformGenerator(8, n_uavs)),
         ({"distribution": "clustered"}, ClusteredGenerator(8, n_uavs)),
         ({"generator": ClusteredGenerator(8, n_uavs, n_clusters=1)}, ClusteredGenerator(8, n_uavs, n_clusters=1)),
-    ]:
+    ]
+    for kwargs, generator in cases:
         env = make(level, n_tasks=8, **kwargs)
         env.reset(seed=11)
         assert th.equal(env.instance.tasks, generator(1, np.random.default_rng(11)).tasks)
@@ -442,12 +451,12 @@ def test_stepping_on_after_the_end(level: str) -> None:
     """Changes nothing and earns nothing."""
     env = make(level, n_tasks=4, render_mode="rgb_array")
     observations, _ = play(env, np.random.default_rng(0), seed=0)
-    image = env.render()
+    image = rendered(env)
     for action in range(3):
         observation, reward, terminated, _, _ = env.step(action)
         assert (reward, terminated) == (0.0, True)
         assert all(np.array_equal(observation[key], observations[-1][key]) for key in observation)
-    assert image is not None and np.array_equal(env.render(), image)
+    assert np.array_equal(rendered(env), image)
 
 
 def test_reward_of_the_allocation_env() -> None:
@@ -497,11 +506,11 @@ def test_rgb_array(level: str) -> None:
     def images() -> list[np.ndarray]:
         rng = np.random.default_rng(0)
         env.reset(seed=0)
-        shown, terminated = [env.render()], False
+        shown, terminated = [rendered(env)], False
         while not terminated:
             terminated = env.step(act(env, rng))[2]
-            shown.append(env.render())
-        return [image for image in shown if image is not None]
+            shown.append(rendered(env))
+        return shown
 
     first = images()
     for image in first:
@@ -512,7 +521,7 @@ def test_rgb_array(level: str) -> None:
     assert n_distinct >= len(first) - 1
     assert all(np.array_equal(a, b) for a, b in zip(first, images(), strict=True))
     env.reset(seed=1)
-    assert not np.array_equal(env.render(), first[0])
+    assert not np.array_equal(rendered(env), first[0])
     env.close()
     env.close()
 

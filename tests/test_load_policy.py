@@ -32,7 +32,7 @@ def make_model(
     env_id: str = "TaskAllocation-U3-N20-v0",
     policy_kwargs: dict[str, Any] | None = None,
 ) -> Any:
-    env = make_vec_env(env_id, 4, vec_env_cls=BatchedVecEnv)
+    env = make_vec_env(env_id, 4, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
     small = {} if algorithm is REINFORCE else {"n_steps": 16}
     return algorithm(policy, env, policy_kwargs=dict(TINY if policy_kwargs is None else policy_kwargs), device="cpu", **small)
 

@@ -169,6 +169,22 @@ def test_more_samples_are_never_worse(instances: Instances) -> None:
     assert best[-1].sum() > best[0].sum()
 
 
+@pytest.mark.parametrize("samples", [1, 3, dl_drl.SAMPLE_BLOCK + 2])
+def test_as_many_samples_as_asked_for(samples: int, instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The router plans one tour per sample and UAV."""
+    pair = make_pair(decode="sampling", samples=samples)
+    planned: list[int] = []
+    plan = pair.router.plan
+
+    def counting_plan(subsets: Instances, max_rows: int) -> th.Tensor:
+        planned.append(len(subsets))
+        return plan(subsets, max_rows)
+
+    monkeypatch.setattr(pair.router, "plan", counting_plan)
+    pair.solve(instances)
+    assert sum(planned) == samples * 9 * 3
+
+
 def test_sampling_follows_the_seed(instances: Instances) -> None:
     pair = make_pair(decode="sampling", samples=2)
     th.manual_seed(1)
@@ -272,8 +288,8 @@ class Typed:
 
 def test_typed_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SOLVERS, "typed", f"{__name__}:Typed")
-    assert json.dumps(make_solver("typed:number=1e-3,flag=true,text=a=b").options) == json.dumps(
-        dict(number=1e-3, flag=True, text="a=b")
-    )
+    solver: Any = make_solver("typed:number=1e-3,flag=true,text=a=b")
+    # As JSON, because there True is not 1.
+    assert json.dumps(solver.options) == json.dumps(dict(number=1e-3, flag=True, text="a=b"))
     with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false"):
         make_solver("typed:flag=yes")

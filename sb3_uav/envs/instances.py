@@ -168,7 +168,7 @@ class Instances:
     def __len__(self) -> int:
         return self.batch_size
 
-    def __getitem__(self, rows: int | slice | th.Tensor | np.ndarray | Sequence[int]) -> Instances:
+    def __getitem__(self, rows: int | np.integer | slice | th.Tensor | np.ndarray | Sequence[int]) -> Instances:
         """Select rows; an ``int`` gives a batch of one, and one that is out of range an ``IndexError``."""
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):

@@ -69,6 +69,8 @@ def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> 
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):
         draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
+        # Maps of other proportions leave room below, not above.
+        axes.set_anchor("N")
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
     save_figure(figure, path)

@@ -13,14 +13,10 @@ import torch as th
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
+from sb3_uav.reinforce.streams import HELD_OUT_STREAM, random_stream
 
 if TYPE_CHECKING:
     from sb3_uav.reinforce.reinforce import REINFORCE
-
-# Independent streams of random numbers, all derived from the algorithm's seed and a counter: training never sees an instance
-# of another stream, and a resumed run draws what an unbroken one would have drawn.
-TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM = 0, 1, 2
-
 
 class Baseline(ABC):
     """
@@ -163,7 +159,7 @@ class RolloutBaseline(Baseline):
         assert problem is not None and self.model.baseline_policy is not None
         policy, copy = self.model.policy, self.model.baseline_policy
         draw = getattr(problem.generator, "held_out", problem.generator)
-        instances = draw(self.n_test_instances, self.model.stream(HELD_OUT_STREAM, self.model.epoch))
+        instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
         gains = []
         for rows in th.arange(len(instances)).split(1024):
             part = instances[rows].to(self.model.device)

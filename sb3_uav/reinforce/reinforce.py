@@ -29,8 +29,9 @@ from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
-from sb3_uav.reinforce.baselines import ACTION_STREAM, BASELINES, TRAINING_STREAM, Baseline
+from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.saving import save_atomically
+from sb3_uav.reinforce.streams import ACTION_STREAM, TRAINING_STREAM, random_stream
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 
@@ -206,14 +207,6 @@ class REINFORCE(OnPolicyAlgorithm):
             return None
         return find_problem(self.env)
 
-    def stream(self, stream: int, counter: int) -> np.random.Generator:
-        """
-        :param stream: Which stream of random numbers
-        :param counter: Which part of it
-        :return: A generator that depends on nothing but the seed and these two
-        """
-        return np.random.default_rng([self.stream_seed, stream, counter])
-
     def draw_batch(self, index: int) -> Instances:
         """
         The training instances of one update; the same ones whenever asked.
@@ -222,14 +215,14 @@ class REINFORCE(OnPolicyAlgorithm):
         :return: ``n_envs`` instances on the CPU
         """
         assert self.problem is not None
-        return self.problem.generator(self.n_envs, self.stream(TRAINING_STREAM, index))
+        return self.problem.generator(self.n_envs, random_stream(self.stream_seed, TRAINING_STREAM, index))
 
     def action_generator(self, counter: int) -> th.Generator:
         """
         :param counter: Number of the update, from 0
         :return: The source of its sampled actions, on the device of the policy
         """
-        seed = int(self.stream(ACTION_STREAM, counter).integers(2**63 - 1))
+        seed = int(random_stream(self.stream_seed, ACTION_STREAM, counter).integers(2**63 - 1))
         return th.Generator(self.device).manual_seed(seed)
 
     def collect_rollouts(

@@ -79,15 +79,14 @@ def _spread_centres(points: np.ndarray, n_clusters: int, rng: np.random.Generato
     """
     k-means++: each next centre is a point drawn with probability proportional to its squared distance to the centres so far.
 
-    :return: ``(at most n_clusters, 2)``; fewer when all points are centres already
+    :return: ``(n_clusters, 2)``
     """
     centres = points[rng.integers(len(points))][None]
     nearest = np.full(len(points), np.inf)
     while len(centres) < n_clusters:
         nearest = np.minimum(nearest, np.square(points - centres[-1]).sum(-1))
         cumulated = nearest.cumsum()
-        if cumulated[-1] == 0.0:
-            break
+        # One past the end if every point is a centre already; its cluster then stays empty.
         drawn = np.searchsorted(cumulated, rng.random() * cumulated[-1], side="right")
         centres = np.vstack([centres, points[min(drawn, len(points) - 1)]])
     return centres

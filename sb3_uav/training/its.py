@@ -34,6 +34,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.reinforce import NO_STEP_LIMIT, find_problem
 from sb3_uav.reinforce.saving import save_atomically
+from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, random_stream
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 
@@ -45,8 +46,6 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
 }
 # The paper's names (Fig. 5); "independent" is DL-DRL-I.
 STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive", "independent")
-# A stream of random numbers of its own, disjoint from those of REINFORCE.
-SUBSET_STREAM = 10
 
 CHECKPOINT_FOLDER = "its_checkpoint"
 STATE_FILE = "its_state.json"
@@ -264,6 +263,7 @@ class ITSCallback(BaseCallback):
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self.router.policy, RouterPolicy):
             raise ValueError(f"router: policy must be a RouterPolicy, found {type(self.router.policy).__name__}.")
+        self._start_router_env()
         outputs = [f for f in self.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
         self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
@@ -353,7 +353,7 @@ class ITSCallback(BaseCallback):
                 draw_batch,
                 range(first, first + n_batches),
                 fraction,
-                lambda chunk: np.random.default_rng([self._seed(), SUBSET_STREAM, self.epoch, chunk]),
+                lambda chunk: random_stream(self._seed(), SUBSET_STREAM, self.epoch, chunk),
             )
         )
         self._freezers["allocator"].freeze()
@@ -369,7 +369,7 @@ class ITSCallback(BaseCallback):
         return -(-self.instances_per_epoch // self.training_env.num_envs)
 
     def _draw_new_batch(self, index: int) -> Any:
-        rng = np.random.default_rng([self._seed(), SUBSET_STREAM + 1, self.epoch, index])
+        rng = random_stream(self._seed(), TRAINING_STREAM, self.epoch, index)
         return self.problem.generator(self.training_env.num_envs, rng)
 
     def _seed(self) -> int:
@@ -477,7 +477,13 @@ class ITSCallback(BaseCallback):
         loaded = type(self.router).load(folder / state["router"], env=self._router_env, device=self.model.device)
         loaded.set_logger(self.router.logger)
         self.router = loaded
+        self._start_router_env()
         self._freezers["router"] = Freezer(self.router.policy)
+
+    def _start_router_env(self) -> None:
+        """Reset now what SB3 would reset when the router first learns, which may be in the middle of generated subsets."""
+        self.router._last_obs = self._router_env.reset()  # type: ignore[assignment]
+        self.router._last_episode_starts = np.ones(self._router_env.num_envs, dtype=bool)
 
 
 def read_state(folder: Path) -> dict[str, Any]:
