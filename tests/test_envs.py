@@ -213,6 +213,8 @@ def test_given_instance_is_played(level: str, instances: Instances, seed: int) -
         assert np.array_equal(observation["values"][:n_tasks], instances.values[0].float().numpy())
         assert observation["task_mask"].tolist() == instances.task_mask[0].tolist() + [0] * (9 - n_tasks)
         assert observation["max_distance"] == instances.max_distance.float().numpy()
+        if level == "routing":
+            assert not observation["visited"][observation["task_mask"] == 0].any()
     report = check_schedule(instances, 0, Schedule(env.episodes.routes(0)))
     assert report.objective == pytest.approx(sum(rewards), rel=1e-12, abs=0)
     # The next episode draws again.

@@ -372,6 +372,17 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, small: Instances, monk
     assert_equal(Instances.load(path), small)
 
 
+def test_save_replaces_the_file_at_once(tmp_path: Path, small: Instances) -> None:
+    """Who has the old file open reads it to its end, and not a mixture."""
+    path = tmp_path / "plan.npz"
+    small.save(path)
+    before = path.read_bytes()
+    with path.open("rb") as reader:
+        small[:1].save(path)
+        assert reader.read() == before
+    assert len(Instances.load(path)) == 1
+
+
 def test_save_into_a_missing_folder(tmp_path: Path, small: Instances) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
         small.save(tmp_path / "nowhere" / "plan.npz")

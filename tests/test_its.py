@@ -1,5 +1,6 @@
 import csv
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,27 +17,31 @@ from sb3_uav.training import Freezer, ITSCallback
 from sb3_uav.training.its import CHECKPOINT_FOLDER, LOG_FILE, read_state
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 
-SMALL = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
-PAPER = dict(SMALL, preset="paper")
+SMALL: dict[str, Any] = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
+PAPER: dict[str, Any] = dict(SMALL, preset="paper")
 N_TASKS, N_UAVS, N_ENVS = 5, 2, 4
 
 
-def make_env(n_envs: int = N_ENVS, n_uavs: int = N_UAVS) -> BatchedVecEnv:
+def make_env(n_envs: int = N_ENVS, n_uavs: int = N_UAVS) -> Any:
     return BatchedVecEnv([lambda: TaskAllocationEnv(N_TASKS, n_uavs, max_distance=1.5)] * n_envs)
 
 
-def make_allocator(n_uavs: int = N_UAVS, **kwargs) -> REINFORCE:
-    settings = dict(baseline="exponential", instances_per_epoch=8, learning_rate=1e-2, seed=0, device="cpu", policy_kwargs=SMALL)
+def make_allocator(n_uavs: int = N_UAVS, **kwargs) -> Any:
+    settings: dict[str, Any] = dict(
+        baseline="exponential", instances_per_epoch=8, learning_rate=1e-2, seed=0, device="cpu", policy_kwargs=SMALL
+    )
     return REINFORCE(AllocatorPolicy, make_env(n_uavs=n_uavs), **{**settings, **kwargs})
 
 
-def make_its(router: dict | None = None, **kwargs) -> ITSCallback:
-    router = dict(policy="RouterPolicy", n_envs=4, learning_rate=1e-2, policy_kwargs=SMALL, **(router or {}))
-    settings = dict(n_epochs=6, n_pretraining_epochs=2, n_intensive_epochs=4, n_continuous_epochs=2)
-    return ITSCallback(router, **{**settings, **kwargs})
+def make_its(router: dict | None = None, **kwargs) -> Any:
+    router_settings: dict[str, Any] = dict(
+        policy="RouterPolicy", n_envs=4, learning_rate=1e-2, policy_kwargs=SMALL, **(router or {})
+    )
+    settings: dict[str, Any] = dict(n_epochs=6, n_pretraining_epochs=2, n_intensive_epochs=4, n_continuous_epochs=2)
+    return ITSCallback(router_settings, **{**settings, **kwargs})
 
 
-def learn(model: REINFORCE, its: ITSCallback, *others: BaseCallback) -> REINFORCE:
+def learn(model: REINFORCE, its: ITSCallback, *others: BaseCallback) -> Any:
     return model.learn(10**9, callback=[its, *others])
 
 
@@ -61,9 +66,7 @@ def trace(its: ITSCallback) -> str:
 def test_order_of_epochs_is_algorithm_1(n_uavs, n_intensive, n_continuous):
     """U4: 5 + (4 + 4) + 92 router epochs, U6: 5 + (6 + 6) + 88, for 100 allocator epochs."""
     model = make_allocator(n_uavs, instances_per_epoch=4)
-    its = make_its(
-        n_epochs=100, n_pretraining_epochs=5, n_intensive_epochs=n_intensive, n_continuous_epochs=n_continuous
-    )
+    its = make_its(n_epochs=100, n_pretraining_epochs=5, n_intensive_epochs=n_intensive, n_continuous_epochs=n_continuous)
     learn(model, its)
     block = "a" * n_continuous + "i" * n_continuous
     assert trace(its) == "p" * 5 + block * 2 + "at" * (100 - n_intensive)
@@ -162,7 +165,7 @@ def test_freezer_restores_only_what_learned_before():
 # ------------------------------------------------------------------------------------------ the router's data
 
 
-def make_subsets(fraction: float, n_batches: int = 3) -> tuple[AllocatedSubsets, REINFORCE]:
+def make_subsets(fraction: float, n_batches: int = 3) -> tuple[AllocatedSubsets, Any]:
     model = make_allocator()
     subsets = AllocatedSubsets(
         model.policy,
@@ -280,8 +283,8 @@ class Interrupt(BaseCallback):
 @pytest.mark.parametrize("epochs", [0, 1, 2, 3, 5])
 def test_resumed_run_equals_an_unbroken_one(baseline, epochs, tmp_path):
     """Interrupted in any phase, after pre-training included: allocator, router and log go on as if nothing had happened."""
-    settings = dict(baseline=baseline, policy_kwargs=PAPER, lr_decay=0.9)
-    router = dict(baseline=baseline, lr_decay=0.9)
+    settings: dict[str, Any] = dict(baseline=baseline, policy_kwargs=PAPER, lr_decay=0.9)
+    router: dict[str, Any] = dict(baseline=baseline, lr_decay=0.9)
     if baseline == "rollout":
         settings["baseline_kwargs"] = router["baseline_kwargs"] = dict(n_test_instances=20)
     unbroken, its = make_allocator(**settings), make_its(router)
@@ -298,7 +301,9 @@ def test_resumed_run_equals_an_unbroken_one(baseline, epochs, tmp_path):
     resumed.learn(10**9, callback=resumed_its, reset_num_timesteps=False)
     assert equal(unbroken.policy.state_dict(), resumed.policy.state_dict())
     assert equal(its.router.policy.state_dict(), resumed_its.router.policy.state_dict())
-    assert [(r.level, r.epoch, r.objective) for r in its.records] == [(r.level, r.epoch, r.objective) for r in resumed_its.records]
+    assert [(r.level, r.epoch, r.objective) for r in its.records] == [
+        (r.level, r.epoch, r.objective) for r in resumed_its.records
+    ]
 
 
 def test_interrupted_during_the_router_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -333,7 +338,7 @@ def test_best_router_is_kept_with_the_best_allocator(tmp_path):
 @pytest.mark.parametrize("algo", ["ppo", "ppo_mask", "a2c"])
 def test_router_of_another_algorithm(algo):
     """Any on-policy algorithm of SB3 can be the router's."""
-    router = dict(algo=algo, n_steps=8, baseline=None)
+    router: dict[str, Any] = dict(algo=algo, n_steps=8, baseline=None)
     router.pop("baseline")
     if algo != "a2c":
         router.update(batch_size=16, n_epochs=1)

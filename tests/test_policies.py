@@ -1,6 +1,8 @@
 """The networks: what the paper prescribes, and that every way to use them computes the same."""
 
 import math
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +18,13 @@ from sb3_uav.policies import AllocatorExtractor, AllocatorPolicy, EpisodicPolicy
 from sb3_uav.policies.base import sample_actions
 from sb3_uav.policies.encoder import AttentionEncoder, NodeNorm, StaticObservation
 
-SMALL = dict(embed_dim=16, n_layers=2, n_heads=4, ff_dim=32)
+SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=2, n_heads=4, ff_dim=32)
+# Leaves the sizes to the preset.
+UNSET: dict[str, Any] = dict.fromkeys(SMALL)
 LEVELS = ("allocator", "router")
 
 
-def make_policy(level: str, n_uavs: int = 3, n_tasks: int = 7, seed: int = 0, **kwargs) -> EpisodicPolicy:
+def make_policy(level: str, n_uavs: int = 3, n_tasks: int = 7, seed: int = 0, **kwargs) -> Any:
     th.manual_seed(seed)
     env = TaskAllocationEnv(n_tasks, n_uavs) if level == "allocator" else RoutePlanningEnv(n_tasks)
     cls = AllocatorPolicy if level == "allocator" else RouterPolicy
@@ -29,7 +33,7 @@ def make_policy(level: str, n_uavs: int = 3, n_tasks: int = 7, seed: int = 0, **
     return policy
 
 
-def make_vec(level: str, n_envs: int = 4, n_tasks: int = 7, n_uavs: int = 3) -> BatchedVecEnv:
+def make_vec(level: str, n_envs: int = 4, n_tasks: int = 7, n_uavs: int = 3) -> Any:
     if level == "allocator":
         return BatchedVecEnv([lambda: TaskAllocationEnv(n_tasks, n_uavs)] * n_envs)
     return BatchedVecEnv([lambda: RoutePlanningEnv(n_tasks)] * n_envs)
@@ -52,14 +56,14 @@ def test_paper_preset_parameter_counts():
     layer = 4 * d * d + (d * ff + ff) + (ff * d + d) + 2 * 2 * d
     encoder = 2 * (2 * d + d) + 3 * layer
     assert layer == 197_760 and encoder == 594_048
-    allocator = make_policy("allocator", n_uavs=4, n_tasks=80, preset="paper", **dict.fromkeys(SMALL))
+    allocator = make_policy("allocator", n_uavs=4, n_tasks=80, preset="paper", **UNSET)
     assert count(allocator.features_extractor.encoder) == encoder
     decoder = (4 * d * d + d) + (d * ff + ff) + (ff * d + d)
     assert count(allocator.features_extractor) == encoder + decoder
     assert count(allocator.action_net) == 2 * d * 4 + 4
     assert count(allocator) == encoder + decoder + (2 * d * 4 + 4) + (2 * d + 1)
 
-    router = make_policy("router", n_tasks=80, preset="paper", **dict.fromkeys(SMALL))
+    router = make_policy("router", n_tasks=80, preset="paper", **UNSET)
     pointer = d * d + (d + 1) * d + 3 * d * d + d * d
     assert count(router.features_extractor) == encoder + pointer
     assert count(router.action_net) == 0
@@ -67,7 +71,7 @@ def test_paper_preset_parameter_counts():
 
 
 def test_paper_preset_layers():
-    encoder = make_policy("router", preset="paper", **dict.fromkeys(SMALL)).features_extractor.encoder
+    encoder = make_policy("router", preset="paper", **UNSET).features_extractor.encoder
     assert len(encoder.layers) == 3
     assert encoder.embed_depot.weight.shape == encoder.embed_task.weight.shape == (128, 2)
     assert encoder.embed_depot.weight is not encoder.embed_task.weight
@@ -80,6 +84,12 @@ def test_paper_preset_layers():
         assert layer.feed_forward[0].out_features == 512 and isinstance(layer.feed_forward[1], nn.ReLU)
 
 
+def reference_batch_norm(p: dict[str, np.ndarray], layer: int, name: str, x: np.ndarray) -> np.ndarray:
+    prefix = f"layers.{layer}.{name}.norm."
+    scaled = (x - p[prefix + "running_mean"]) / np.sqrt(p[prefix + "running_var"] + 1e-5)
+    return scaled * p[prefix + "weight"] + p[prefix + "bias"]
+
+
 def reference_encoder(encoder: AttentionEncoder, depot: np.ndarray, tasks: np.ndarray) -> np.ndarray:
     """One instance through the encoder in plain numpy: paper, equations (11) to (15), batch norm in evaluation mode."""
     p = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
@@ -87,12 +97,9 @@ def reference_encoder(encoder: AttentionEncoder, depot: np.ndarray, tasks: np.nd
         [depot @ p["embed_depot.weight"].T + p["embed_depot.bias"], tasks @ p["embed_task.weight"].T + p["embed_task.bias"]]
     )
     d = nodes.shape[1]
+    layer: Any
     for i, layer in enumerate(encoder.layers):
-
-        def norm(x: np.ndarray, name: str) -> np.ndarray:
-            mean, var = p[f"layers.{i}.{name}.norm.running_mean"], p[f"layers.{i}.{name}.norm.running_var"]
-            return (x - mean) / np.sqrt(var + 1e-5) * p[f"layers.{i}.{name}.norm.weight"] + p[f"layers.{i}.{name}.norm.bias"]
-
+        norm = partial(reference_batch_norm, p, i)
         query, key, value = np.split(nodes @ p[f"layers.{i}.attention.project_in.weight"].T, 3, axis=1)
         heads = []
         size = d // layer.attention.n_heads
@@ -102,10 +109,10 @@ def reference_encoder(encoder: AttentionEncoder, depot: np.ndarray, tasks: np.nd
             weight = np.exp(score - score.max(1, keepdims=True))
             heads.append(weight / weight.sum(1, keepdims=True) @ value[:, part])
         attended = np.hstack(heads) @ p[f"layers.{i}.attention.project_out.weight"].T
-        nodes = norm(nodes + attended, "attention_norm")
+        nodes = norm("attention_norm", nodes + attended)
         hidden = np.maximum(nodes @ p[f"layers.{i}.feed_forward.0.weight"].T + p[f"layers.{i}.feed_forward.0.bias"], 0)
         hidden = hidden @ p[f"layers.{i}.feed_forward.2.weight"].T + p[f"layers.{i}.feed_forward.2.bias"]
-        nodes = norm(nodes + hidden, "feed_forward_norm")
+        nodes = norm("feed_forward_norm", nodes + hidden)
     return nodes
 
 
@@ -114,6 +121,7 @@ def shake_statistics(policy: EpisodicPolicy) -> None:
     generator = th.Generator().manual_seed(1)
     for module in policy.modules():
         if isinstance(module, nn.BatchNorm1d):
+            assert module.running_mean is not None and module.running_var is not None
             module.running_mean.copy_(th.randn(module.num_features, generator=generator) * 0.1)
             module.running_var.copy_(th.rand(module.num_features, generator=generator) + 0.5)
             module.weight.data.copy_(th.rand(module.num_features, generator=generator) + 0.5)
@@ -363,8 +371,10 @@ def test_action_masks_argument_overrides_the_observation(level):
 def parameters_after_training(level: str, n_envs: int, use_cache: bool) -> dict[str, th.Tensor]:
     env = make_vec(level, n_envs)
     env.seed(0)
-    kwargs = dict(n_steps=14, batch_size=14 * n_envs // 2, n_epochs=2, seed=1, policy_kwargs=SMALL, device="cpu")
-    model = PPO(type(make_policy(level)), env, **kwargs)
+    kwargs: dict[str, Any] = dict(
+        n_steps=14, batch_size=14 * n_envs // 2, n_epochs=2, seed=1, policy_kwargs=SMALL, device="cpu"
+    )
+    model: Any = PPO(type(make_policy(level)), env, **kwargs)
     model.policy.features_extractor.use_cache = use_cache
     model.learn(14 * n_envs * 3)
     return model.policy.state_dict()
@@ -454,7 +464,7 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
 @pytest.mark.parametrize("level", LEVELS)
 def test_extractors_serve_stock_multi_input_policy(level):
     extractor = AllocatorExtractor if level == "allocator" else RouterExtractor
-    kwargs = dict(features_extractor_class=extractor, features_extractor_kwargs=SMALL)
+    kwargs: dict[str, Any] = dict(features_extractor_class=extractor, features_extractor_kwargs=SMALL)
     model = PPO("MultiInputPolicy", make_vec(level), n_steps=16, batch_size=32, n_epochs=1, policy_kwargs=kwargs, device="cpu")
     before = [parameter.clone() for parameter in model.policy.features_extractor.parameters()]
     model.learn(128)
@@ -467,7 +477,7 @@ def test_stock_ppo_trains_evaluates_and_reloads(level, tmp_path):
     env = make_vec(level)
     model = PPO(type(make_policy(level)), env, n_steps=16, batch_size=32, n_epochs=1, policy_kwargs=SMALL, device="cpu")
     model.learn(64)
-    mean, _ = evaluate_policy(model, env, n_eval_episodes=8)
+    mean = np.mean(evaluate_policy(model, env, n_eval_episodes=8)[0])
     assert 0 < mean <= 7
     model.save(tmp_path / "model")
     loaded = PPO.load(tmp_path / "model", device="cpu")
@@ -479,7 +489,7 @@ def test_first_full_batch_epoch_of_ppo_has_ratio_one():
     """Catches dropout, normalization and cache faults at once: nothing may differ between acting and training."""
     for level in LEVELS:
         env = make_vec(level, 8)
-        kwargs = dict(n_steps=14, batch_size=112, n_epochs=1, policy_kwargs=SMALL, device="cpu", seed=0)
+        kwargs: dict[str, Any] = dict(n_steps=14, batch_size=112, n_epochs=1, policy_kwargs=SMALL, device="cpu", seed=0)
         model = PPO(type(make_policy(level)), env, **kwargs)
         model.learn(112)
         assert abs(model.logger.name_to_value["train/approx_kl"]) < 1e-6
@@ -520,10 +530,11 @@ def test_foreign_observation_space_is_refused():
 
 
 def test_batch_norm_learns_from_real_nodes_only():
-    norm = NodeNorm("batch", 4)
+    norm: Any = NodeNorm("batch", 4)
     nodes = th.randn(3, 5, 4)
     mask = th.tensor([[1, 1, 1, 1, 1], [1, 1, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=th.bool)
     reference = nn.BatchNorm1d(4)
     expected = reference(nodes[mask])
     assert th.equal(norm(nodes, mask)[mask], expected)
+    assert reference.running_mean is not None
     assert th.equal(norm.norm.running_mean, reference.running_mean)

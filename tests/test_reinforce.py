@@ -3,6 +3,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,19 +27,21 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.baselines import significantly_positive, student_t_quantile
 
-SMALL = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
+SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 BASELINES = ("none", "exponential", "shared", "critic", "rollout")
 
 
-def make_env(level: str = "allocator", n_envs: int = 4, n_tasks: int = 6, max_distance: float = 1.2) -> BatchedVecEnv:
+def make_env(level: str = "allocator", n_envs: int = 4, n_tasks: int = 6, max_distance: float = 1.2) -> Any:
     if level == "allocator":
         return BatchedVecEnv([lambda: TaskAllocationEnv(n_tasks, 2, max_distance=max_distance)] * n_envs)
     return BatchedVecEnv([lambda: RoutePlanningEnv(n_tasks, max_distance=max_distance)] * n_envs)
 
 
-def make_model(level: str = "allocator", baseline: str = "shared", env=None, **kwargs) -> REINFORCE:
+def make_model(level: str = "allocator", baseline: str = "shared", env=None, **kwargs) -> Any:
     policy = AllocatorPolicy if level == "allocator" else RouterPolicy
-    settings = dict(n_samples=3, instances_per_epoch=8, seed=0, device="cpu", policy_kwargs=SMALL, learning_rate=1e-3)
+    settings: dict[str, Any] = dict(
+        n_samples=3, instances_per_epoch=8, seed=0, device="cpu", policy_kwargs=SMALL, learning_rate=1e-3
+    )
     if baseline == "rollout":
         settings["baseline_kwargs"] = dict(n_test_instances=16)
     return REINFORCE(policy, env or make_env(level), baseline=baseline, **{**settings, **kwargs})
@@ -59,10 +62,10 @@ def assert_equal_parameters(a: REINFORCE, b: REINFORCE) -> None:
 def test_cartpole_reaches_400():
     """With SB3's own policy and loop; a random agent scores about 20."""
     env = make_vec_env("CartPole-v1", 8, seed=0)
-    kwargs = dict(learning_rate=5e-3, n_steps=256, gamma=0.99, normalize_advantage=True, seed=0, device="cpu")
+    kwargs: dict[str, Any] = dict(learning_rate=5e-3, n_steps=256, gamma=0.99, normalize_advantage=True, seed=0, device="cpu")
     model = REINFORCE("MlpPolicy", env, baseline="exponential", **kwargs)
     model.learn(150_000)
-    mean, _ = evaluate_policy(model, make_vec_env("CartPole-v1", 8, seed=100), n_eval_episodes=20)
+    mean = np.mean(evaluate_policy(model, make_vec_env("CartPole-v1", 8, seed=100), n_eval_episodes=20)[0])
     assert mean >= 400
 
 
@@ -74,7 +77,9 @@ def test_router_learns_with_every_baseline(baseline):
     nearest = collected_value(test, nearest_feasible(test)).mean().item()
     env = make_env("router", 64, 15, 2.0)
     network = dict(embed_dim=32, n_layers=1, n_heads=4, ff_dim=64)
-    model = make_model("router", baseline, env, n_samples=4, learning_rate=2e-3, policy_kwargs=network, instances_per_epoch=640)
+    model = make_model(
+        "router", baseline, env, n_samples=4, learning_rate=2e-3, policy_kwargs=network, instances_per_epoch=640
+    )
     model.normalize_advantage = baseline != "critic"
     untrained = collected_value(test, model.policy.plan(test)).mean().item()
     model.learn_instances(64 * 100)
@@ -111,10 +116,11 @@ def test_loss_is_the_papers():
 
     class Spy(BaseCallback):
         def _on_rollout_end(self) -> None:
-            batch = self.model._batch
-            evaluation = self.model.policy.evaluate_episodes(batch.instances, batch.actions)
+            algorithm: Any = self.model
+            batch = algorithm._batch
+            evaluation = algorithm.policy.evaluate_episodes(batch.instances, batch.actions)
             loss = (-batch.returns.float() * evaluation.log_prob.sum(-1)).mean()
-            gradients["expected"] = th.autograd.grad(loss, self.model.policy.action_net.weight)[0]
+            gradients["expected"] = th.autograd.grad(loss, algorithm.policy.action_net.weight)[0]
 
         def _on_step(self) -> bool:
             return True
@@ -199,7 +205,7 @@ def test_same_seed_same_parameters(level):
 @pytest.mark.parametrize("baseline", BASELINES)
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_save_load_continue_equals_no_break(baseline, preset, tmp_path):
-    kwargs = dict(policy_kwargs={**SMALL, "preset": preset}, lr_decay=0.9)
+    kwargs: dict[str, Any] = dict(policy_kwargs={**SMALL, "preset": preset}, lr_decay=0.9)
     unbroken = make_model(baseline=baseline, **kwargs).learn_instances(40)
     broken = make_model(baseline=baseline, **kwargs).learn_instances(20)
     broken.save(tmp_path / "model")
@@ -215,6 +221,7 @@ def test_zip_holds_the_baseline_and_no_surprises(tmp_path):
     model.save(tmp_path / "model.zip")
     data, parameters, _ = load_from_zip_file(tmp_path / "model.zip")
     assert set(parameters) == {"policy", "policy.optimizer", "baseline_policy"}
+    assert data is not None
     assert data["baseline"] == "rollout" and "_batch" not in data and "_baseline" not in data
     raw = json.loads(zipfile.ZipFile(tmp_path / "model.zip").read("data"))
     ours = ("n_samples", "baseline", "baseline_kwargs", "instances_per_epoch", "lr_decay", "stream_seed", "baseline_state")
@@ -222,6 +229,7 @@ def test_zip_holds_the_baseline_and_no_surprises(tmp_path):
         assert not (isinstance(raw[name], dict) and ":serialized:" in raw[name]), name
     loaded = REINFORCE.load(tmp_path / "model.zip")
     assert_equal_parameters(model, loaded)
+    assert loaded.baseline_policy is not None
     for parameter in loaded.baseline_policy.parameters():
         assert not parameter.requires_grad
 
@@ -361,7 +369,9 @@ def test_advantages_of_the_step_loop_by_hand():
     env = make_vec_env("CartPole-v1", 2, seed=0)
     model = REINFORCE("MlpPolicy", env, n_steps=64, gamma=0.9, baseline="none", seed=0, device="cpu")
     _, callback = model._setup_learn(128)
+    assert model.env is not None
     model.collect_rollouts(model.env, callback, model.rollout_buffer, 64)
+    assert model._last_episode_starts is not None
     buffer = model.rollout_buffer
     expected = np.zeros((64, 2))
     for i in range(2):

@@ -12,7 +12,7 @@ from conftest import instance_batches
 from hypothesis import given, settings
 
 from sb3_uav.envs import ClusteredGenerator, InstanceGenerator, Instances, UniformGenerator, check_schedule
-from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy, memory
 from sb3_uav.solvers import DLDRL, SOLVERS, Solver, dl_drl, make_solver
 from sb3_uav.solvers.heuristics import KMeansNearest, kmeans
 
@@ -152,13 +152,13 @@ def test_memory_bounds_the_batch(instances: Instances, monkeypatch: pytest.Monke
     """With hardly any memory, instances are solved one by one, and nothing else changes."""
     pair = make_pair(decode="sampling", samples=3)
     roomy = pair.solve(instances, 0)
-    monkeypatch.setattr(dl_drl, "CPU_MEMORY", 1)
+    monkeypatch.setattr(memory, "CPU_MEMORY", 1)
     tight = pair.solve(instances, 0)
     assert [result.batch_size for result in tight] == [1] * 9
     assert [result.schedule for result in tight] == [result.schedule for result in roomy]
     monkeypatch.undo()
     router = make_policy(RouterPolicy, embed_dim=128, n_heads=8)
-    assert 1 <= dl_drl.rows_that_fit(router, 1501) < dl_drl.rows_that_fit(router, 81) < 10_000
+    assert 1 <= router.rows_that_fit(1501) < router.rows_that_fit(81) < 10_000
 
 
 def test_more_samples_are_never_worse(instances: Instances) -> None:
@@ -176,9 +176,9 @@ def test_as_many_samples_as_asked_for(samples: int, instances: Instances, monkey
     planned: list[int] = []
     plan = pair.router.plan
 
-    def counting_plan(subsets: Instances, max_rows: int) -> th.Tensor:
+    def counting_plan(subsets: Instances) -> th.Tensor:
         planned.append(len(subsets))
-        return plan(subsets, max_rows)
+        return plan(subsets)
 
     monkeypatch.setattr(pair.router, "plan", counting_plan)
     pair.solve(instances)

@@ -68,7 +68,7 @@ class ProblemEnv(gym.Env[dict[str, np.ndarray], np.int64]):
         return self._observation(), reward, terminated, False, info
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {key: value[0].copy() for key, value in self.episodes.observation().items()}
+        return {key: value[0] for key, value in self.episodes.observation().items()}
 
     def action_masks(self) -> np.ndarray:
         """``(n_actions,)`` bool, True where an action is legal (the protocol of sb3-contrib's ``MaskablePPO``)."""

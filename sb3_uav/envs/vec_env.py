@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
@@ -17,7 +17,13 @@ from sb3_uav.envs.gym_env import ProblemEnv, set_generator
 from sb3_uav.envs.problem import Episodes, Problem, given_instance
 
 # Wrappers that change nothing here: episodes end by themselves before any time limit, and episode statistics are kept below.
-TRANSPARENT_WRAPPERS = (Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker)
+TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker)
+
+
+def _is_time_limit(wrapper: Any) -> bool:
+    # By name, because rl_zoo3 replaces gymnasium's TimeLimit by a subclass (rl_zoo3/gym_patches.py), before or after this
+    # module is imported.
+    return any(cls.__name__ == "TimeLimit" and cls.__module__.startswith("gymnasium.") for cls in type(wrapper).__mro__)
 
 
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
@@ -27,7 +33,7 @@ def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     """
     inner: Any = env
     # Exact types and ProblemEnv's own methods only: a subclass may do something else.
-    while type(inner) in TRANSPARENT_WRAPPERS:
+    while type(inner) in TRANSPARENT_WRAPPERS or _is_time_limit(inner):
         inner = inner.env
     if not isinstance(inner, ProblemEnv):
         return None

@@ -24,6 +24,7 @@ from torch import nn
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
+from sb3_uav.policies.memory import rows_that_fit
 
 # The settings of the encoder, by preset; arguments of the policy override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -193,8 +194,8 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     """
     A masked categorical actor-critic policy with attention, for stock PPO, A2C and MaskablePPO and for our REINFORCE.
 
-    The mask comes from ``observation["action_mask"]`` when the algorithm passes no ``action_masks``, so it cannot be forgotten.
-    Its networks work for any number of tasks; the observation space binds only SB3's step loop to one.
+    The mask comes from ``observation["action_mask"]`` when the algorithm passes no ``action_masks``, so it cannot be
+    forgotten. Its networks work for any number of tasks; the observation space binds only SB3's step loop to one.
 
     :param observation_space: Of one of our environments
     :param action_space: Of the same environment
@@ -279,6 +280,14 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :param n_actions: Number of actions where the network is bound to it
         :return: Observation space, action space
         """
+
+    def rows_that_fit(self, n_nodes: int, n_subsets: int = 0) -> int:
+        """
+        :param n_nodes: Nodes of each instance, the depot included
+        :param n_subsets: Into how many subsets each is going to be split at once
+        :return: How many instances this policy can treat at once, at least 1
+        """
+        return rows_that_fit(self.device, self.features_extractor.encoder.n_heads, n_nodes, n_subsets)
 
     # ---------------------------------------------------------------------------------------------------- decoding
 
@@ -379,14 +388,14 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         distribution.apply_masking(obs["action_mask"].bool() if action_masks is None else action_masks)
         return distribution, values
 
-    def forward(  # type: ignore[override]
+    def forward(
         self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         distribution, values = self._decode_observation(obs, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         return actions, values[:, None], distribution.log_prob(actions)
 
-    def evaluate_actions(  # type: ignore[override]
+    def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         distribution, values = self._decode_observation(obs, action_masks)

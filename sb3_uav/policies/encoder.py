@@ -223,6 +223,7 @@ class AttentionEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.use_values = use_values
+        self.n_heads = n_heads
         self.embed_depot = nn.Linear(2, embed_dim)
         self.embed_task = nn.Linear(3 if use_values else 2, embed_dim)
         self.layers = nn.ModuleList(AttentionLayer(embed_dim, n_heads, ff_dim, normalization) for _ in range(n_layers))

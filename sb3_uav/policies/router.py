@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.type_aliases import Schedule, TensorDict
 from torch import nn
 
 from sb3_uav.envs.instances import Instances, UniformGenerator
@@ -17,6 +17,8 @@ from sb3_uav.policies.encoder import StaticObservation, attend
 
 # Logits are clipped to +-10 (paper, equation of u; Bello et al.).
 LOGIT_CLIP = 10.0
+# Into how many chunks by size subsets are cut before they are padded.
+SIZE_CLASSES = 4
 
 
 class RouterState(NamedTuple):
@@ -102,8 +104,9 @@ class RouterExtractor(EpisodicExtractor):
 
 class RouterPolicy(EpisodicPolicy):
     """
-    The lower level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments; the number of tasks is free.
+    The lower level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments.
 
+    The number of tasks is free.
     ``net_arch`` shapes the critic only, because the actor's logits are the extractor's compatibilities.
     """
 
@@ -121,11 +124,11 @@ class RouterPolicy(EpisodicPolicy):
         super()._build_mlp_extractor()
         self.features_dim = features_dim
 
-    def _build(self, lr_schedule) -> None:  # type: ignore[no-untyped-def]
+    def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.action_net = nn.Identity()
         self.mlp_extractor.policy_net = nn.Sequential()
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _heads(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         embed_dim = self.features_extractor.embed_dim
@@ -161,27 +164,27 @@ class RouterPolicy(EpisodicPolicy):
         return stacked, stacked.action_mask
 
     @th.no_grad()
-    def plan(self, instances: Instances, max_rows: int = 4096) -> th.Tensor:
+    def plan(self, instances: Instances, max_rows: int | None = None) -> th.Tensor:
         """
         Plan tours greedily: the router of allocation environments and solvers.
 
         Rows are taken in order of size, so that small subsets are not padded to the largest.
 
         :param instances: ``batch`` single-UAV instances, on any device
-        :param max_rows: How many rows to decode at once; bounds the memory
+        :param max_rows: How many rows to decode at once; as many as memory allows when None
         :return: ``(batch, n_steps)`` int64 node indices padded with the depot, on the device of the instances
         """
         self.set_training_mode(False)
-        sizes = instances.task_mask.sum(1)
-        order = sizes.argsort()
-        chunk = max(min(max_rows, math.ceil(len(order) / 4)), 1)
-        tours, rows = [], []
-        for part in order.split(chunk):
-            n_tasks = max(int(sizes[part[-1]]), 1)
-            subsets = instances[part].trim(n_tasks).to(self.device)
-            tours.append(self.decode_episodes(subsets)[:, 0].to(instances.device))
-            rows.append(part)
-        planned = tours[0].new_full((len(order), max(tour.shape[1] for tour in tours)), DEPOT)
-        for part, tour in zip(rows, tours, strict=True):
-            planned[part, : tour.shape[1]] = tour
-        return planned
+        sizes, order = instances.task_mask.sum(1).clamp(min=1).sort()
+        sorted_sizes = sizes.tolist()
+        chunk = min(max_rows or len(order), math.ceil(len(order) / SIZE_CLASSES))
+        planned = th.full((len(order), instances.n_tasks + 1), DEPOT, device=instances.device)
+        start, longest = 0, 1
+        while start < len(order):
+            largest = sorted_sizes[min(start + chunk, len(order)) - 1]
+            rows = order[start : start + min(chunk, self.rows_that_fit(largest + 1))]
+            subsets = instances[rows].trim(largest).to(self.device)
+            tours = self.decode_episodes(subsets)[:, 0].to(instances.device)
+            planned[rows, : tours.shape[1]] = tours
+            start, longest = start + len(rows), max(longest, tours.shape[1])
+        return planned[:, :longest]

@@ -18,6 +18,7 @@ from sb3_uav.reinforce.streams import HELD_OUT_STREAM, random_stream
 if TYPE_CHECKING:
     from sb3_uav.reinforce.reinforce import REINFORCE
 
+
 class Baseline(ABC):
     """
     A baseline of returns.
@@ -51,12 +52,13 @@ class Baseline(ABC):
         """
         raise ValueError(f"{type(self).__name__} needs whole episodes.")
 
-    def end_epoch(self, problem: Problem | None) -> None:
+    def end_epoch(self, problem: Problem) -> None:
         """
-        Called after the last update of every epoch.
+        Called after the last update of every epoch; most baselines have nothing to do then.
 
-        :param problem: What is being learned, None with SB3's step loop
+        :param problem: What is being learned
         """
+        return
 
 
 class NoBaseline(Baseline):
@@ -155,8 +157,8 @@ class RolloutBaseline(Baseline):
         assert self.model.baseline_policy is not None
         return greedy_returns(self.model.baseline_policy, problem, instances)
 
-    def end_epoch(self, problem: Problem | None) -> None:
-        assert problem is not None and self.model.baseline_policy is not None
+    def end_epoch(self, problem: Problem) -> None:
+        assert self.model.baseline_policy is not None
         policy, copy = self.model.policy, self.model.baseline_policy
         draw = getattr(problem.generator, "held_out", problem.generator)
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -97,6 +98,9 @@ class REINFORCE(OnPolicyAlgorithm):
         "AllocatorPolicy": AllocatorPolicy,
         "RouterPolicy": RouterPolicy,
     }
+
+    # SB3 declares an ActorCriticPolicy, which ours are not.
+    policy: ActorCriticPolicy | MaskableActorCriticPolicy  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -186,9 +190,10 @@ class REINFORCE(OnPolicyAlgorithm):
         if self._baseline.needs_episodes and not issubclass(self.policy_class, EpisodicPolicy):
             self._refuse_baseline()
         if self.baseline == "rollout":
-            self.baseline_policy = deepcopy(self.policy)  # type: ignore[assignment]
-            self.baseline_policy.requires_grad_(False)  # type: ignore[union-attr]
-            self.baseline_policy.set_training_mode(False)  # type: ignore[union-attr]
+            assert isinstance(self.policy, EpisodicPolicy)
+            self.baseline_policy = deepcopy(self.policy)
+            self.baseline_policy.requires_grad_(False)
+            self.baseline_policy.set_training_mode(False)
         if self.baseline != "critic" and hasattr(self.policy, "value_net"):
             # Never trained, and 0 everywhere, so that SB3's bootstrap of time limits adds nothing.
             for parameter in self.policy.value_net.parameters():
@@ -243,6 +248,7 @@ class REINFORCE(OnPolicyAlgorithm):
     def _compute_step_advantages(self, rollout_buffer: RolloutBuffer) -> None:
         """Replace the buffer's advantages by return minus baseline, and by 0 in episodes that have not ended."""
         if self.baseline != "critic":
+            assert self._last_episode_starts is not None
             ended_after = np.vstack([rollout_buffer.episode_starts[1:], self._last_episode_starts]).astype(bool)
             complete = np.logical_or.accumulate(ended_after[::-1])[::-1]
         else:

@@ -13,7 +13,6 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
-from sb3_uav.policies.encoder import AttentionLayer
 from sb3_uav.solvers.base import Solver, SolverResult
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
@@ -22,29 +21,6 @@ DECODINGS = ("greedy", "sampling")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
-# What one pass may take on a CPU, in bytes. More is not faster there.
-CPU_MEMORY = 2**30
-# What encoder and decoder take per node beside the attention weights: about 1,000 float32 in a default network, four times.
-NODE_MEMORY = 2**14
-# What splitting takes per task, sample and UAV: coordinates and indices in float64 and int64, and their copies.
-SPLIT_MEMORY = 48
-
-
-def rows_that_fit(policy: EpisodicPolicy, n_nodes: int, n_subsets: int = 0) -> int:
-    """
-    :param policy: Encodes the instances
-    :param n_nodes: Nodes of each instance, the depot included
-    :param n_subsets: Into how many subsets each is going to be split at once
-    :return: How many instances can be treated at once, at least 1
-    """
-    memory = CPU_MEMORY
-    if policy.device.type == "cuda":
-        memory = th.cuda.mem_get_info(policy.device)[0] // 4
-    layers = policy.features_extractor.encoder.layers
-    n_heads = max((layer.attention.n_heads for layer in layers if isinstance(layer, AttentionLayer)), default=1)
-    # Scores, scores with the bias of padded nodes, and weights live at the same time, in float32.
-    per_node = 3 * 4 * n_heads * n_nodes + NODE_MEMORY + SPLIT_MEMORY * n_subsets
-    return max(memory // (n_nodes * per_node), 1)
 
 
 def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
@@ -118,7 +94,7 @@ class DLDRL(Solver):
         self.check(instances)
         self.allocator.set_training_mode(False)
         n_samples = SAMPLE_BLOCK if self.decode == "sampling" else 1
-        fitting = rows_that_fit(self.allocator, instances.n_tasks + 1, n_samples * instances.n_uavs)
+        fitting = self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
         batch_size = min(self.batch_size or fitting, fitting)
         results = []
         for rows in th.arange(len(instances)).split(batch_size):
@@ -140,14 +116,14 @@ class DLDRL(Solver):
         with th.no_grad():
             cache = self.allocator.encode(instances)
         if self.decode == "greedy":
-            planned = plan_tours(instances, self.allocator.decode_episodes(instances, cache=cache), self._plan)
+            planned = plan_tours(instances, self.allocator.decode_episodes(instances, cache=cache), self.router.plan)
             return schedules(planned.tours[:, 0])
         best_value = th.full((len(instances),), -th.inf, dtype=th.float64, device=instances.device)
         best = [Schedule([])] * len(instances)
         for first in range(0, self.samples, SAMPLE_BLOCK):
             n_samples = min(SAMPLE_BLOCK, self.samples - first)
             assignment = self._sample_block(instances, cache, rows, seed, first)[:, :n_samples]
-            planned = plan_tours(instances, assignment, self._plan)
+            planned = plan_tours(instances, assignment, self.router.plan)
             value, sample = planned.value.max(1)
             tours = planned.tours[th.arange(len(instances), device=sample.device), sample]
             for row, (schedule, better) in enumerate(zip(schedules(tours), (value > best_value).tolist(), strict=True)):
@@ -176,8 +152,3 @@ class DLDRL(Solver):
             own = Cache(cache.nodes[i : i + 1], tuple(projection[i : i + 1] for projection in cache.projections))
             blocks.append(self.allocator.decode_episodes(instances[i], SAMPLE_BLOCK, False, generator, own))
         return th.cat(blocks)
-
-    def _plan(self, subsets: Instances) -> th.Tensor:
-        """The router's greedy tours, in chunks that fit the memory; see :meth:`RouterPolicy.plan`."""
-        largest = int(subsets.task_mask.sum(1).max()) + 1
-        return self.router.plan(subsets, rows_that_fit(self.router, largest))

@@ -26,6 +26,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.routing import RoutePlanningEnv
@@ -41,7 +42,7 @@ from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
     "reinforce": REINFORCE,
     "ppo": PPO,
-    "ppo_mask": MaskablePPO,  # type: ignore[dict-item]
+    "ppo_mask": MaskablePPO,
     "a2c": A2C,
 }
 # The paper's names (Fig. 5); "independent" is DL-DRL-I.
@@ -261,19 +262,24 @@ class ITSCallback(BaseCallback):
             self.router = algorithm(env=self._router_env, seed=seed, device=self.model.device, **kwargs)
         except TypeError as error:
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
-        if not isinstance(self.router.policy, RouterPolicy):
-            raise ValueError(f"router: policy must be a RouterPolicy, found {type(self.router.policy).__name__}.")
+        if not isinstance(self._router_policy, RouterPolicy):
+            raise ValueError(f"router: policy must be a RouterPolicy, found {type(self._router_policy).__name__}.")
         self._start_router_env()
         outputs = [f for f in self.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
         self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
         self._freezers = {"allocator": Freezer(self.model.policy), "router": Freezer(self.router.policy)}
 
+    @property
+    def _router_policy(self) -> BasePolicy:
+        """The router's policy; SB3 declares it an ``ActorCriticPolicy``, which a maskable one is not."""
+        return self.router.policy
+
     def _hand_over_router(self) -> None:
-        assert isinstance(self.router.policy, RouterPolicy)
+        assert isinstance(self._router_policy, RouterPolicy)
         environments = [self.training_env, *(callback.eval_env for callback in self._siblings(EvalCallback))]
         for env in environments:
-            env.env_method("set_router", self.router.policy.plan)
+            env.env_method("set_router", self._router_policy.plan)
 
     def _siblings(self, kind: type[BaseCallback]) -> list[Any]:
         """The callbacks of this kind in the same training."""

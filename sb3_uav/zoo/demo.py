@@ -29,18 +29,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     args, train_args = parser.parse_known_args(argv)
 
-    from sb3_uav.zoo import cli, train
+    from sb3_uav.zoo import train
 
     logs = args.out / "logs"
     code = train.main(
-        ["--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)]
-        + ["--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "80", "--eval-freq", "500000"]
-        + ["--eval-episodes", "50", *(["--progress"] if sys.stdout.isatty() else []), *train_args]
+        [
+            *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
+            *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
+            *("--eval-freq", "1000000", "--eval-episodes", "50"),
+            *(["--progress"] if sys.stdout.isatty() else []),
+            *train_args,
+        ]
     )
     if code != 0:
         return code
-    run = newest_run(logs / "reinforce", args.env)
-    return evaluate_run(cli, run, args)
+    return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
 
 
 def newest_run(folder: Path, env_id: str) -> Path:
@@ -53,32 +56,61 @@ def newest_run(folder: Path, env_id: str) -> Path:
     return max(runs, key=lambda path: int(path.name.rpartition("_")[2]))
 
 
-def evaluate_run(cli, run: Path, args: argparse.Namespace) -> int:  # type: ignore[no-untyped-def]
-    """Evaluate and draw what the training left in ``run``."""
+def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int) -> int:
+    """
+    Evaluate what a training run left beside heuristics, print the table and draw the figures.
+
+    :param run: rl_zoo3's folder of the run
+    :param env_id: Id of its environment
+    :param out: Folder of the results
+    :param n_instances: Number of test instances
+    :param seed: Seed of the solvers
+    :return: Exit code: 1 if a schedule was infeasible
+    """
     import gymnasium as gym
 
-    from sb3_uav.envs import Instances, TaskAllocationEnv
+    from sb3_uav.envs import TaskAllocationEnv
     from sb3_uav.plots.learning_curves import plot_learning_curves
-    from sb3_uav.plots.schedule_map import plot_best_and_worst_solver
+    from sb3_uav.plots.schedule_map import MapPanel, plot_schedules
+    from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+    from sb3_uav.policies.loading import load_policy
+    from sb3_uav.solvers.base import Solver, make_solver
+    from sb3_uav.solvers.dl_drl import DLDRL
+    from sb3_uav.solvers.evaluation import evaluate, print_table
     from sb3_uav.training.its import LOG_FILE
 
-    environment = gym.make(args.env).unwrapped
+    environment = gym.make(env_id).unwrapped
     assert isinstance(environment, TaskAllocationEnv)
-    instances: Instances = environment.problem.generator(args.n_instances, np.random.default_rng(TEST_SEED))
-    test_set = args.out / "instances.npz"
-    instances.save(test_set)
+    instances = environment.problem.generator(n_instances, np.random.default_rng(TEST_SEED))
+    instances.save(out / "instances.npz")
 
-    results = args.out / "results"
-    pair = ["--allocator", str(run / f"{args.env}.zip"), "--router", str(run / "router.zip")]
-    code = cli.main(
-        ["evaluate", *pair, "--instances", str(test_set), "--decode", "sampling", "--untrained", "--out", str(results)]
-        + ["--solvers", "kmeans-nearest", "random-nearest", "--seed", str(args.seed)]
-    )
-    if code != 0:
-        return code
-    plot_learning_curves(run / LOG_FILE, args.out / "learning_curves.png")
-    print(f"Learning curves: {args.out / 'learning_curves.png'}")
-    return 0
+    allocator = load_policy(run / f"{env_id}.zip", expected=AllocatorPolicy)
+    router = load_policy(run / "router.zip", expected=RouterPolicy)
+    greedy, sampling = DLDRL(allocator, router), DLDRL(allocator, router, "sampling")
+    heuristics = [make_solver("kmeans-nearest"), make_solver("random-nearest")]
+    solvers: list[Solver] = [greedy, sampling, greedy.untrained(seed), *heuristics]
+    print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
+    summary = evaluate(solvers, instances, out / "results", seed)
+    print_table(summary)
+
+    plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
+    panels = []
+    for solver in (sampling, heuristics[0]):
+        schedule = solver.solve(instances[0], seed)[0].schedule
+        panels.append(MapPanel(instances, 0, schedule, f"{solver.name}: {schedule.n_visited} tasks"))
+    plot_schedules(panels, out / "schedule.png")
+    files = {
+        "trained allocator": run / f"{env_id}.zip",
+        "trained router": run / "router.zip",
+        "results": out / "results" / "results.csv",
+        "schedules": out / "results" / "schedules.jsonl",
+        "learning curves": out / "learning_curves.png",
+        "a schedule": out / "schedule.png",
+    }
+    for what, path in files.items():
+        print(f"{what:>18}: {path}")
+    print(f"{'training curves':>18}: tensorboard --logdir {out / 'tensorboard'}")
+    return int(any(row.violations for row in summary))
 
 
 if __name__ == "__main__":

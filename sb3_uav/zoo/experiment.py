@@ -17,7 +17,7 @@ except ImportError as error:
     raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
 
 from sb3_contrib import MaskablePPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -26,7 +26,7 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
 
-OUR_ALGORITHMS = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
+OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
 # What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
 ZOO_KEYS = {
     "n_envs",
@@ -122,8 +122,8 @@ class UAVExperimentManager(ExperimentManager):
     @property
     def its(self) -> ITSCallback | None:
         """The interactive training strategy of this run, if it has one."""
-        found: list[BaseCallback] = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
-        return found[0] if found else None  # type: ignore[return-value]
+        found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
+        return found[0] if found else None
 
 
 def check_keys(found: set[str], algorithm: type, where: str) -> None:
@@ -133,7 +133,7 @@ def check_keys(found: set[str], algorithm: type, where: str) -> None:
     :param where: File and entry, named in the error
     :raises ValueError: On a key that neither knows
     """
-    known = ZOO_KEYS | set(inspect.signature(algorithm.__init__).parameters) - {"self", "_init_setup_model", "env"}
+    known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
     for key in sorted(found - known):
         nearest = difflib.get_close_matches(key, known, n=1)
         advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."

@@ -1,0 +1,306 @@
+"""Training from YAML through rl_zoo3: the files that it leaves, and what a user reads when something is wrong."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from stable_baselines3.common.results_plotter import load_results
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv
+from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.policies.loading import load_policy
+from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training import ITSCallback
+from sb3_uav.training.its import read_state
+
+pytest.importorskip("rl_zoo3")
+from sb3_uav.zoo import cli, enjoy, train  # noqa: E402
+from sb3_uav.zoo.demo import evaluate_run, newest_run  # noqa: E402
+from sb3_uav.zoo.experiment import default_config, parse_schedule  # noqa: E402
+
+ENV = "TaskAllocation-U3-N20-v0"
+NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
+# Steps of an epoch: 8 instances of 20 tasks.
+EPOCH = 8 * 20
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    router: dict[str, Any] = dict(algo="reinforce", policy="RouterPolicy", n_envs=4, policy_kwargs=NETWORK, learning_rate=1e-3)
+    its = dict(router=router, n_epochs=3, n_pretraining_epochs=1, n_intensive_epochs=2, n_continuous_epochs=2)
+    settings = dict(
+        policy="sb3_uav.policies.AllocatorPolicy",
+        policy_kwargs=NETWORK,
+        n_envs=4,
+        n_timesteps=3 * EPOCH,
+        instances_per_epoch=8,
+        learning_rate=1e-3,
+        callback=[{"sb3_uav.training.ITSCallback": its}],
+    )
+    return {**settings, **changes}
+
+
+def write_config(folder: Path, **changes: Any) -> Path:
+    path = folder / "tiny.yml"
+    path.write_text(yaml.safe_dump({ENV: entry(**changes)}))
+    return path
+
+
+def run(folder: Path, config: Path, *flags: str) -> int:
+    return train.main(["--env", ENV, "--conf-file", str(config), "-f", str(folder / "logs"), "--seed", "1", *flags])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of `python -m sb3_uav.zoo.train` in a process of its own; the folder above its logs."""
+    folder = tmp_path_factory.mktemp("zoo")
+    config = write_config(folder)
+    flags = ["--eval-freq", "160", "--eval-episodes", "4", "--save-freq", "320", "-tb", str(folder / "tb"), "--seed", "1"]
+    command = [sys.executable, "-m", "sb3_uav.zoo.train", "--algo", "reinforce", "--env", ENV, "--conf-file", str(config)]
+    subprocess.run([*command, "-f", str(folder / "logs"), *flags], check=True, capture_output=True, cwd=folder)
+    return folder
+
+
+def run_folder(folder: Path) -> Path:
+    return newest_run(folder / "logs" / "reinforce", ENV)
+
+
+@pytest.mark.slow
+def test_log_folder_is_the_zoos(trained):
+    """Every file that rl_zoo3 leaves, and the router's."""
+    folder = run_folder(trained)
+    assert folder.name == f"{ENV}_1"
+    expected = {f"{ENV}.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv", ENV, "rl_model_320_steps.zip"}
+    ours = {"router.zip", "best_router.zip", "its_log.csv", "its_checkpoint"}
+    assert expected | ours == {path.name for path in folder.iterdir()}
+    assert {path.name for path in (folder / ENV).iterdir()} == {"config.yml", "args.yml", "command.txt"}
+    saved = yaml.load((folder / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)  # written by rl_zoo3 just now
+    assert dict(saved)["instances_per_epoch"] == 8
+    evaluations = np.load(folder / "evaluations.npz")
+    assert evaluations["timesteps"].tolist() == [160, 320, 480] and evaluations["results"].shape == (3, 4)
+    monitor = load_results(str(folder))
+    assert len(monitor) == 6 and (monitor["l"] == 20).all() and (monitor["r"] <= 20).all()
+    assert list((trained / "tb").rglob("events.out.tfevents.*"))
+
+
+@pytest.mark.slow
+def test_saved_zips_are_ordinary_and_play_together(trained, tmp_path):
+    folder = run_folder(trained)
+    model = REINFORCE.load(folder / f"{ENV}.zip")
+    assert (model.epoch, model.n_instances, model.num_timesteps) == (3, 24, 480)
+    assert model.seed == 1 and isinstance(model.policy, AllocatorPolicy)
+    arguments = ["--allocator", str(folder / f"{ENV}.zip"), "--router", str(folder / "router.zip"), "--out", str(tmp_path)]
+    test_set = tmp_path / "test.npz"
+    TaskAllocationEnv(30, 3).problem.generator(3, np.random.default_rng(0)).save(test_set)
+    assert cli.main(["evaluate", *arguments, "--instances", str(test_set)]) == 0
+    assert len((tmp_path / "results.csv").read_text().splitlines()) == 4
+
+
+@pytest.mark.slow
+def test_enjoy_replays_with_the_trained_router(trained, capsys):
+    arguments = ["--env", ENV, "-f", str(trained / "logs"), "-n", "60", "--no-render"]
+    for flags in ([], ["--load-best"], ["--load-checkpoint", "320"]):
+        assert enjoy.main([*arguments, *flags]) == 0
+        printed = capsys.readouterr().out
+        assert printed.count("Episode Reward:") == 3 and "3 Episodes" in printed
+        name = "best_router.zip" if flags == ["--load-best"] else "router.zip"
+        assert f"Rewards come from the router {run_folder(trained) / name}" in printed
+
+
+@pytest.mark.slow
+def test_enjoy_names_a_missing_run(tmp_path, capsys):
+    assert enjoy.main(["--env", ENV, "-f", str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_resumed_run_equals_an_unbroken_one(trained, tmp_path, capsys):
+    """`-i` with the checkpoint of an interrupted run, whatever seed the zoo draws."""
+    config = write_config(tmp_path, n_timesteps=2 * EPOCH)
+    assert run(tmp_path, config, "--eval-freq", "-1") == 0
+    first = run_folder(tmp_path)
+    state = read_state(first / "its_checkpoint")
+    assert state["epoch"] == 2
+    config = write_config(tmp_path)
+    allocator = first / "its_checkpoint" / state["allocator"]
+    arguments = ["--env", ENV, "--conf-file", str(config), "-f", str(tmp_path / "logs"), "-n", str(EPOCH), "--eval-freq", "-1"]
+    assert train.main([*arguments, "-i", str(allocator)]) == 0
+    second = run_folder(tmp_path)
+    assert second != first
+    for name in (f"{ENV}.zip", "router.zip"):
+        resumed, unbroken = load_policy(second / name), load_policy(run_folder(trained) / name)
+        for key, value in unbroken.state_dict().items():
+            assert th.equal(value, resumed.state_dict()[key]), (name, key)
+    assert len((second / "its_log.csv").read_text().splitlines()) == 1 + 1 + 3 + 3
+
+
+@pytest.mark.slow
+def test_demo_files_from_a_run(trained, tmp_path, capsys):
+    assert evaluate_run(run_folder(trained), ENV, tmp_path, 5, 0) == 0
+    for name in ("results/results.csv", "results/schedules.jsonl", "learning_curves.png", "schedule.png", "instances.npz"):
+        assert (tmp_path / name).stat().st_size > 0
+    solvers = {line.split(",")[0] for line in (tmp_path / "results/results.csv").read_text().splitlines()[1:]}
+    assert len(solvers) == 5 and {"kmeans-nearest", "random-nearest"} <= solvers
+    assert "DL-DRL untrained" in capsys.readouterr().out
+
+
+class Spy(ITSCallback):
+    """Notes the sizes that training and evaluation environments were made with."""
+
+    seen: Any = None
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        evaluations = self._siblings(type(self.locals["callback"].callbacks[-1]))
+        environments = [self.training_env, evaluations[-1].eval_env]
+        type(self).seen = [env.get_attr("problem")[0].generator.max_distance for env in environments]
+
+
+@pytest.mark.slow
+def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path):
+    """They do not in stock rl_zoo3 2.9.2; those of the command line replace them, in both."""
+    config = write_config(tmp_path, env_kwargs=dict(max_distance=1.25))
+    text = config.read_text().replace("sb3_uav.training.ITSCallback", f"{__name__}.Spy")
+    config.write_text(text)
+    assert run(tmp_path, config, "-n", "80") == 0
+    assert Spy.seen == [1.25, 1.25]
+    assert run(tmp_path, config, "-n", "80", "--env-kwargs", "max_distance:1.75") == 0
+    assert Spy.seen == [1.75, 1.75]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("normalize", [{"norm_obs": False, "norm_reward": True}])
+def test_zoo_keys_are_honoured(tmp_path, normalize):
+    """Wrappers, schedules, and numbers that YAML takes for text."""
+    its_free = dict(callback=None, n_steps=20, n_timesteps=4 * 20 * 2, learning_rate="lin_1e-3", ent_coef="1e-2")
+    config = write_config(tmp_path, normalize=normalize, monitor_kwargs={}, **its_free)
+    assert run(tmp_path, config, "--eval-freq", "80", "--log-interval", "1") == 0
+    model = REINFORCE.load(run_folder(tmp_path) / f"{ENV}.zip")
+    assert model.ent_coef == 0.01 and isinstance(model.learning_rate, LinearSchedule)
+    assert (run_folder(tmp_path) / ENV / "vecnormalize.pkl").is_file()
+
+
+@pytest.mark.slow
+def test_other_environments_work(tmp_path):
+    arguments = ["--env", "CartPole-v1", "-f", str(tmp_path), "-n", "5000", "--seed", "0", "--eval-freq", "-1"]
+    assert train.main(["--algo", "reinforce", *arguments]) == 0
+    assert REINFORCE.load(tmp_path / "reinforce/CartPole-v1_1/CartPole-v1.zip").num_timesteps >= 5000
+
+
+@pytest.mark.slow
+def test_hyperparameters_of_the_command_line(tmp_path):
+    config = write_config(tmp_path)
+    assert run(tmp_path, config, "-n", "80", "-params", "learning_rate:0.5", "baseline:'none'", "--eval-freq", "-1") == 0
+    model = REINFORCE.load(run_folder(tmp_path) / f"{ENV}.zip")
+    assert (model.learning_rate, model.baseline, model.num_timesteps) == (0.5, "none", 80)
+
+
+# ------------------------------------------------------------------------------------------ bad input
+
+
+def its_with(**changes: Any) -> dict[str, Any]:
+    callback = entry()["callback"]
+    callback[0]["sb3_uav.training.ITSCallback"].update(changes)
+    return dict(callback=callback)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(learnin_rate=1), "unknown key 'learnin_rate'; did you mean 'learning_rate'?"),
+        (dict(baseline="rollout", frobnicate=1), "unknown key 'frobnicate'; known keys:"),
+        (dict(learning_rate="fast"), "learning_rate is 'fast'; write a number, lin_X or const_X."),
+        (dict(baseline="rolout"), "baseline is 'rolout'; choose one of"),
+        (dict(policy_kwargs=dict(preset="papper")), "preset is 'papper'"),
+        (its_with(n_epoch=3), "an argument of 'callback' does not fit"),
+        (its_with(strategy="none"), "strategy is 'none'"),
+        (its_with(router=dict(policy="RouterPolicy", n_stepz=3)), "these arguments do not fit algorithm 'reinforce'"),
+    ],
+)
+def test_typos_in_the_yaml_are_named(tmp_path, capsys, changes, message):
+    config = write_config(tmp_path, **changes)
+    assert run(tmp_path, config, "--eval-freq", "-1") == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.zip"))
+
+
+def test_broken_configs_are_named(tmp_path, capsys):
+    config = tmp_path / "broken.yml"
+    for text, message in (
+        ("a: [1", "cannot be read"),
+        ("other: {policy: MlpPolicy}", "Hyperparameters not found"),
+        (f"{ENV}: {{policy: MlpPolicy}}", "needs at least n_timesteps and policy"),
+    ):
+        config.write_text(text)
+        assert run(tmp_path, config) == 2
+        error = capsys.readouterr().err
+        assert message in error and "broken.yml" in error
+    assert run(tmp_path, tmp_path / "missing.yml") == 2
+    assert "missing.yml" in capsys.readouterr().err
+    assert train.main(["--env", "TaskAllocation-U3-N21-v0"]) == 2
+    assert "TaskAllocation-U3-N21-v0 not found in gym registry, you maybe meant TaskAllocation-U3-N20-v0?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "expected"),
+    [("learning_rate", "1e-3", 0.001), ("learning_rate", "const_0.5", 0.5), ("ent_coef", "1e-2", 0.01)],
+)
+def test_numbers_as_text(key, text, expected):
+    assert parse_schedule(key, text) == expected
+
+
+def test_linear_schedule():
+    schedule = parse_schedule("learning_rate", "lin_0.1")
+    assert isinstance(schedule, LinearSchedule)
+    assert [schedule(1.0), schedule(0.5), schedule(0.0)] == pytest.approx([0.1, 0.05, 0.0])
+    with pytest.raises(ValueError, match="ent_coef is 'lin_0.1'; write a number"):
+        parse_schedule("ent_coef", "lin_0.1")
+
+
+# ------------------------------------------------------------------------------------------ the shipped YAML
+
+
+def shipped() -> dict[str, Any]:
+    path = default_config("reinforce")
+    assert path is not None and default_config("dqn") is None
+    return yaml.safe_load(path.read_text())
+
+
+@pytest.mark.parametrize("n_uavs", PAPER_FLEETS)
+@pytest.mark.parametrize("n_tasks", PAPER_SIZES)
+def test_shipped_settings_are_the_papers(n_uavs, n_tasks):
+    """Section V-A of the paper and DESIGN section 5."""
+    settings = shipped()[allocation_id(n_uavs, n_tasks)]
+    batch = 512 if n_tasks < 300 else 256
+    assert settings["n_envs"] == batch and settings["policy_kwargs"] == {"preset": "paper"}
+    assert settings["n_timesteps"] == 100 * 1_280_000 * n_tasks
+    assert (settings["learning_rate"], settings["lr_decay"], settings["max_grad_norm"]) == (1e-4, 0.995, 3.0)
+    assert settings["baseline"] == "rollout" and settings["instances_per_epoch"] == 1_280_000
+    (callback,) = settings["callback"]
+    its = callback["sb3_uav.training.ITSCallback"]
+    assert ITSCallback(**its).n_epochs == 100
+    phases = {4: (5, 8, 4), 6: (5, 12, 6)}[n_uavs]
+    assert (its["n_pretraining_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == phases
+    router = its["router"]
+    assert (router["learning_rate"], router["max_grad_norm"], router["n_envs"]) == (1e-4, 1.0, batch)
+    assert router["baseline"] == "rollout" and router.get("lr_decay", 1.0) == 1.0
+    assert router["policy_kwargs"] == {"preset": "paper"}
+
+
+@pytest.mark.parametrize("name", [ENV, "RoutePlanning-N20-v0"])
+def test_shipped_small_entries_build(name):
+    import gymnasium as gym
+
+    settings = dict(shipped()[name])
+    for key in ("callback", "n_timesteps", "policy"):
+        settings.pop(key, None)
+    env = BatchedVecEnv([lambda: gym.make(name)] * settings.pop("n_envs"))
+    policy = "AllocatorPolicy" if name == ENV else "RouterPolicy"
+    model = REINFORCE(policy, env, device="cpu", seed=0, **settings).learn_instances(64)
+    assert model.n_instances == 64
