@@ -33,6 +33,7 @@ def collect(policy: AllocatorPolicy, env: BatchedVecEnv, use_cache: bool) -> tup
     n_tasks = env.problem.generator.n_tasks
     network, start = 0.0, time.perf_counter()
     for _ in range(n_tasks):
+        assert isinstance(observation, dict)
         tensor = obs_as_tensor(observation, th.device("cpu"))
         before = time.perf_counter()
         with th.no_grad():
@@ -58,6 +59,7 @@ def train_by_step(policy: AllocatorPolicy, instances: Instances, actions: th.Ten
     policy.set_training_mode(True)
     seconds = 0.0
     for step in range(instances.n_tasks):
+        assert isinstance(observation, dict)
         tensor = obs_as_tensor(observation, th.device("cpu"))
         before = time.perf_counter()
         _, log_prob, _ = policy.evaluate_actions(tensor, actions[:, 0, step])

@@ -21,9 +21,9 @@ from sb3_uav.training import ITSCallback
 from sb3_uav.training.its import read_state
 
 pytest.importorskip("rl_zoo3")
-from sb3_uav.zoo import cli, enjoy, train  # noqa: E402
-from sb3_uav.zoo.demo import evaluate_run, newest_run  # noqa: E402
-from sb3_uav.zoo.experiment import default_config, parse_schedule  # noqa: E402
+from sb3_uav.zoo import cli, enjoy, train
+from sb3_uav.zoo.demo import evaluate_run, newest_run
+from sb3_uav.zoo.experiment import default_config, parse_schedule
 
 ENV = "TaskAllocation-U3-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
@@ -244,7 +244,8 @@ def test_broken_configs_are_named(tmp_path, capsys):
     assert run(tmp_path, tmp_path / "missing.yml") == 2
     assert "missing.yml" in capsys.readouterr().err
     assert train.main(["--env", "TaskAllocation-U3-N21-v0"]) == 2
-    assert "TaskAllocation-U3-N21-v0 not found in gym registry, you maybe meant TaskAllocation-U3-N20-v0?" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "TaskAllocation-U3-N21-v0 not found in gym registry, you maybe meant TaskAllocation-U3-N20-v0?" in error
 
 
 @pytest.mark.parametrize(
@@ -259,7 +260,7 @@ def test_linear_schedule():
     schedule = parse_schedule("learning_rate", "lin_0.1")
     assert isinstance(schedule, LinearSchedule)
     assert [schedule(1.0), schedule(0.5), schedule(0.0)] == pytest.approx([0.1, 0.05, 0.0])
-    with pytest.raises(ValueError, match="ent_coef is 'lin_0.1'; write a number"):
+    with pytest.raises(ValueError, match=r"ent_coef is 'lin_0\.1'; write a number"):
         parse_schedule("ent_coef", "lin_0.1")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +11,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Episodes, Problem, given_instance
 
 
-class ProblemEnv(gym.Env[dict[str, np.ndarray], np.int64]):
+class ProblemEnv(gym.Env[Any, Any]):
     """
     One episode of a problem at a time.
 
@@ -23,14 +23,17 @@ class ProblemEnv(gym.Env[dict[str, np.ndarray], np.int64]):
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {  # noqa: RUF012  (as declared by gymnasium)
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(self, problem: Problem, render_mode: str | None = None) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}; choose one of {self.metadata['render_modes']} or None.")
         self.problem = problem
         self.observation_space = problem.observation_space
-        self.action_space = problem.action_space  # type: ignore[assignment]
+        self.action_space = problem.action_space
         self.render_mode = render_mode
         self.episodes = Episodes(problem, 1)
         self._figure: Any = None
@@ -79,7 +82,7 @@ class ProblemEnv(gym.Env[dict[str, np.ndarray], np.int64]):
         """The instance of the running episode, a batch of one."""
         return self.episodes.instances
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """
         Draw the map of the running episode.
 

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -221,28 +222,28 @@ def print_table(summary: Sequence[SummaryRow]) -> None:
     :raises ImportError: If rich is not installed
     """
     rich = require_rich()
-    table = rich.table.Table()
-    for heading in ("Instances", "Solver"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("Number", "Obj.", "Std. error", "s / instance", "Batch", "Infeasible"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row, following in zip(summary, [*summary[1:], None], strict=True):
-        table.add_row(
-            # Text, because rich would take brackets in a name for markup.
-            rich.text.Text(row.source),
-            rich.text.Text(row.solver),
-            str(row.n_instances),
-            _figure(row.objective, 2),
-            _figure(row.standard_error, 2),
-            _figure(row.seconds, 4),
-            str(row.batch_size),
-            str(len(row.violations)),
-            end_section=following is not None and following.source != row.source,
-        )
     console = rich.console.Console()
-    if not console.is_terminal:
-        console.width = FILE_WIDTH
-    console.print(table)
+    for source, rows in groupby(summary, key=lambda row: row.source):
+        table, n_instances = rich.table.Table(), 0
+        table.add_column("Solver", no_wrap=True)
+        # Short enough for a terminal of 80 columns.
+        for heading in ("Obj.", "Std.\nerror", "s per\ninstance", "Batch", "Infea-\nsible"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for row in rows:
+            n_instances = row.n_instances
+            table.add_row(
+                # Text, because rich would take brackets in a name for markup.
+                rich.text.Text(row.solver),
+                _figure(row.objective, 2),
+                _figure(row.standard_error, 2),
+                _figure(row.seconds, 4),
+                str(row.batch_size),
+                str(len(row.violations)),
+            )
+        table.title = rich.text.Text(f"{source}: {n_instances} instances")
+        if not console.is_terminal:
+            console.width = FILE_WIDTH
+        console.print(table)
 
 
 def _figure(value: float, digits: int) -> str:

@@ -23,6 +23,7 @@ from stable_baselines3.common.callbacks import (
     EventCallback,
     ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
+    tqdm,
 )
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -103,7 +104,7 @@ class EpisodeStatistics(BaseCallback):
 
 class RouterProgress(BaseCallback):
     """
-    Says on a progress bar how far the router's epoch is.
+    Says on the allocator's progress bar how far the router's epoch is, because two bars at a time would disturb each other.
 
     :param description: What to say
     :param bar: A tqdm bar
@@ -116,13 +117,22 @@ class RouterProgress(BaseCallback):
         self.n_episodes = 0
 
     def _on_step(self) -> bool:
-        dones = self.locals["dones"]
-        if np.any(dones):
-            self.n_episodes += int(np.sum(dones))
-            n_samples = getattr(self.model, "n_samples", 1)
-            done = min(self.n_episodes / n_samples / self.n_instances, 1.0)
-            self.bar.set_description(f"{self.description} {done:4.0%}")
+        n_finished = int(np.sum(self.locals["dones"]))
+        if n_finished > 0:
+            self.n_episodes += n_finished
+            self.report(min(self.n_episodes / getattr(self.model, "n_samples", 1) / self.n_instances, 1.0))
         return True
+
+    def report(self, done: float) -> None:
+        """:param done: Part of the epoch that is done"""
+        self.bar.set_description(f"{self.description} {done:4.0%}")
+
+
+class OwnProgress(RouterProgress):
+    """The same on a bar of its own, for pre-training, when the allocator has none yet."""
+
+    def report(self, done: float) -> None:
+        self.bar.update(round(done * self.n_instances) - self.bar.n)
 
 
 class ITSCallback(BaseCallback):
@@ -417,8 +427,8 @@ class ITSCallback(BaseCallback):
         assert self.instances_per_epoch is not None
         if getattr(bars[0], "pbar", None) is None:
             # Pre-training: the allocator's bar does not exist yet.
-            bar = ProgressBarCallback.__init__.__globals__["tqdm"](total=1, bar_format="{desc}")
-            return [RouterProgress(description, bar, self.instances_per_epoch)], bar.close
+            bar = tqdm(total=self.instances_per_epoch, desc=description)
+            return [OwnProgress(description, bar, self.instances_per_epoch)], bar.close
         bar = bars[0].pbar
         return [RouterProgress(description, bar, self.instances_per_epoch)], lambda: bar.set_description("allocator")
 

@@ -90,14 +90,16 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     heuristics = [make_solver("kmeans-nearest"), make_solver("random-nearest")]
     solvers: list[Solver] = [greedy, sampling, greedy.untrained(seed), *heuristics]
     print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
-    summary = evaluate(solvers, instances, out / "results", seed)
+    summary = evaluate(solvers, {env_id: instances}, out / "results", seed)
     print_table(summary)
 
     plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
+    # The one whose depot lies most centrally shows most of what a fleet can do.
+    row = int((instances.depot - 0.5).norm(dim=1).argmin())
     panels = []
     for solver in (sampling, heuristics[0]):
-        schedule = solver.solve(instances[0], seed)[0].schedule
-        panels.append(MapPanel(instances, 0, schedule, f"{solver.name}: {schedule.n_visited} tasks"))
+        schedule = solver.solve(instances[row], seed)[0].schedule
+        panels.append(MapPanel(instances, row, schedule, f"{solver.name}: {schedule.n_visited} tasks"))
     plot_schedules(panels, out / "schedule.png")
     files = {
         "trained allocator": run / f"{env_id}.zip",
