@@ -35,7 +35,7 @@ def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: float) -> N
         gym.register(
             id=env_id,
             entry_point=f"sb3_uav.envs.{entry_point}",
-            # Episodes end by themselves after at most n_tasks + 1 steps: this limit is never reached.
-            max_episode_steps=n_tasks + 2,
+            # No max_episode_steps: episodes end by themselves after at most n_tasks + 1 steps, and a limit would cut longer
+            # ones off when the id is made with another n_tasks.
             kwargs={"n_tasks": n_tasks, **kwargs},
         )

@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 
 # One tolerance for the dynamics and for the checker, relative to the maximum flight distance.
-DISTANCE_TOLERANCE = 1e-9
+DISTANCE_TOLERANCE = 5e-10
 
 # What numpy and zipfile raise on damaged files: the last on headers that ask for encryption or an unknown compression.
 UNREADABLE = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError)

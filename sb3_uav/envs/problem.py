@@ -16,9 +16,6 @@ from sb3_uav.envs.instances import InstanceGenerator, Instances
 
 StateT = TypeVar("StateT", bound="State")
 
-# Observation keys that stay the same during an episode; policies encode them once.
-STATIC_KEYS = ("depot", "tasks", "values", "task_mask", "max_distance")
-
 
 class State(Protocol):
     """What every state holds: tensors with leading dimensions (batch, n_samples)."""
@@ -93,7 +90,8 @@ class Problem(ABC):
             "depot": spaces.Box(-np.inf, np.inf, (2,), np.float32),
             # Flat, x and y in turn, because SB3's env checker advises against 2D observations.
             "tasks": spaces.Box(-np.inf, np.inf, (2 * n_tasks,), np.float32),
-            "values": spaces.Box(0.0, np.inf, (n_tasks,), np.float32),
+            # Not "values": SB3's CombinedExtractor keeps keys in an nn.ModuleDict, which has a method of that name.
+            "task_values": spaces.Box(0.0, np.inf, (n_tasks,), np.float32),
             "task_mask": spaces.MultiBinary(n_tasks),
             "max_distance": spaces.Box(0.0, np.inf, (1,), np.float32),
         }
@@ -162,7 +160,7 @@ class Problem(ABC):
         return {
             "depot": instances.depot.float(),
             "tasks": instances.tasks.float().flatten(1),
-            "values": instances.values.float(),
+            "task_values": instances.values.float(),
             "task_mask": instances.task_mask.to(th.int8),
             "max_distance": instances.max_distance.float()[:, None],
         }

@@ -16,14 +16,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from sb3_uav.envs.gym_env import ProblemEnv, set_generator
 from sb3_uav.envs.problem import Episodes, Problem, given_instance
 
-# Wrappers that change nothing here: episodes end by themselves before any time limit, and episode statistics are kept below.
+# Wrappers that change nothing: episode statistics are kept below.
 TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker)
-
-
-def _is_time_limit(wrapper: Any) -> bool:
-    # By name, because rl_zoo3 replaces gymnasium's TimeLimit by a subclass (rl_zoo3/gym_patches.py), before or after this
-    # module is imported.
-    return any(cls.__name__ == "TimeLimit" and cls.__module__.startswith("gymnasium.") for cls in type(wrapper).__mro__)
 
 
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
@@ -33,7 +27,7 @@ def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     """
     inner: Any = env
     # Exact types and ProblemEnv's own methods only: a subclass may do something else.
-    while type(inner) in TRANSPARENT_WRAPPERS or _is_time_limit(inner):
+    while type(inner) in TRANSPARENT_WRAPPERS:
         inner = inner.env
     if not isinstance(inner, ProblemEnv):
         return None

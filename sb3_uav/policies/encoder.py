@@ -37,7 +37,7 @@ class StaticObservation(NamedTuple):
         return cls(
             depot=observation["depot"],
             tasks=observation["tasks"].view(len(observation["tasks"]), -1, 2),
-            values=observation["values"],
+            values=observation["task_values"],
             task_mask=observation["task_mask"].bool(),
             max_distance=observation["max_distance"],
         )
