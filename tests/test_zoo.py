@@ -1,5 +1,6 @@
 """Training from YAML through rl_zoo3: the files that it leaves, and what a user reads when something is wrong."""
 
+import csv
 import subprocess
 import sys
 from pathlib import Path
@@ -147,7 +148,13 @@ def test_demo_files_from_a_run(trained, tmp_path, capsys):
         assert (tmp_path / name).stat().st_size > 0
     solvers = {line.split(",")[0] for line in (tmp_path / "results/results.csv").read_text().splitlines()[1:]}
     assert len(solvers) == 5 and {"kmeans-nearest", "random-nearest"} <= solvers
-    assert "DL-DRL untrained" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "DL-DRL untrained" in printed
+    with (tmp_path / "results/results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    mean = {name: np.mean([float(row["objective"]) for row in rows if row["solver"] == name]) for name in solvers}
+    gain = mean["DL-DRL (sampling 128)"] - mean["random-nearest"]
+    assert f"DL-DRL (sampling 128) against random-nearest: {gain:+.2f} tasks" in printed
 
 
 class Spy(ITSCallback):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
+from torch.nn import functional
 
 from sb3_uav.envs.instances import Instances
 
@@ -153,7 +153,7 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     """
     Scaled dot-product attention of several heads.
 
-    Products are written out: measured on CPU, they beat ``scaled_dot_product_attention`` at these small head sizes
+    Torch's fused kernel was 1.6 to 3.7 times as fast as the products written out, forward and backward on a CPU
     (``benchmarks/attention.py``).
 
     :param query: ``(batch, n_queries, embed_dim)``
@@ -163,13 +163,8 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     :param attention_bias: Added to the scores, broadcast against ``(batch, n_heads, n_queries, n_nodes)``, or None
     :return: ``(batch, n_queries, embed_dim)``
     """
-    query = query.unflatten(-1, (n_heads, -1)).transpose(1, 2)
-    key = key.unflatten(-1, (n_heads, -1)).permute(0, 2, 3, 1)
-    value = value.unflatten(-1, (n_heads, -1)).transpose(1, 2)
-    scores = (query / math.sqrt(query.shape[-1])) @ key
-    if attention_bias is not None:
-        scores = scores + attention_bias
-    return (scores.softmax(-1) @ value).transpose(1, 2).flatten(2)
+    heads = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
+    return functional.scaled_dot_product_attention(*heads, attn_mask=attention_bias).transpose(1, 2).flatten(2)
 
 
 class AttentionLayer(nn.Module):

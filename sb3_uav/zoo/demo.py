@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -76,7 +77,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     from sb3_uav.policies.loading import load_policy
     from sb3_uav.solvers.base import Solver, make_solver
     from sb3_uav.solvers.dl_drl import DLDRL
-    from sb3_uav.solvers.evaluation import evaluate, print_table
+    from sb3_uav.solvers.evaluation import RESULTS_FILE, evaluate, print_table
     from sb3_uav.training.its import LOG_FILE
 
     environment = gym.make(env_id).unwrapped
@@ -92,6 +93,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
     summary = evaluate(solvers, {env_id: instances}, out / "results", seed)
     print_table(summary)
+    print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
 
     plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
     # The one whose depot lies most centrally shows most of what a fleet can do.
@@ -113,6 +115,28 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
         print(f"{what:>18}: {path}")
     print(f"{'training curves':>18}: tensorboard --logdir {out / 'tensorboard'}")
     return int(any(row.violations for row in summary))
+
+
+def print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
+    """
+    Print by how much we are better than others, instance by instance.
+
+    :param results: The ``results.csv`` of an evaluation
+    :param ours: Names of the solvers to compare
+    :param others: Names of the solvers to compare them with
+    """
+    with results.open() as file:
+        rows = list(csv.DictReader(file))
+    objectives = {
+        name: np.array([float(row["objective"] or "nan") for row in rows if row["solver"] == name])
+        for name in (*ours, *others)
+    }
+    for name in ours:
+        for other in others:
+            gain = objectives[name] - objectives[other]
+            error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else float("nan")
+            relative = gain.mean() / objectives[other].mean()
+            print(f"{name} against {other}: {gain.mean():+.2f} tasks ({relative:+.1%}), standard error {error:.2f}")
 
 
 if __name__ == "__main__":

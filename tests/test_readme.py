@@ -1,0 +1,40 @@
+"""What the README shows works as it stands, but for the size of the run."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sb3_uav.envs import Instances
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.policies.loading import load_policy
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_example_of_the_first_screen(tmp_path, monkeypatch):
+    example = EXAMPLES[0]
+    assert len([line for line in example.splitlines() if line and "import" not in line]) <= 8
+    for full, small in (
+        ("n_envs=64", "n_envs=4"),
+        ("instances_per_epoch=2560", "instances_per_epoch=8"),
+        ("n_epochs=10", "n_epochs=1"),
+    ):
+        assert full in example
+        example = example.replace(full, small)
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    load_policy(tmp_path / "run" / "allocator.zip", expected=AllocatorPolicy)
+    load_policy(tmp_path / "run" / "router.zip", expected=RouterPolicy)
+
+
+def test_example_of_own_instances(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(EXAMPLES[1], {})
+    assert Instances.load(tmp_path / "my_instances.npz").n_uavs == 4
+
+
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", README))))
+def test_links_lead_somewhere(target):
+    assert (Path(__file__).parents[1] / target).is_file()
