@@ -350,10 +350,19 @@ def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsy
 
 
 def test_as_a_process(inputs: Inputs, tmp_path: Path) -> None:
-    """What a shell sees: a table on the standard output, one line on the standard error, the exit code."""
+    """What a shell sees: a table on the standard output, remarks on the standard error, the exit code."""
     command = [sys.executable, "-m", "sb3_uav.zoo.cli", "evaluate", "--instances", str(inputs.small), "--out", str(tmp_path)]
     done = subprocess.run([*command, "--solvers", "random-nearest"], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stderr == "random-nearest on U3-N20: 4 instances\n"
+    assert done.returncode == 0 and done.stderr.endswith("random-nearest on U3-N20: 4 instances\n")
     assert "random-nearest" in done.stdout
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
     assert tuple(read_results(tmp_path)[0]) == RESULT_COLUMNS
+
+
+def test_unreachable_tasks_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are no error, because the paper's distribution has them too, but a user should know."""
+    far = Instances.from_arrays([0.0, 0.0], [[0.5, 0.0], [3.0, 0.0], [0.0, 1.1]], max_distance=2.0, n_uavs=1)
+    far.save(tmp_path / "far.npz")
+    assert run("--solvers", "kmeans-nearest", "--instances", tmp_path / "far.npz", "--out", tmp_path / "out") == 0
+    assert "far: 2 of 3 tasks lie farther than max_distance / 2 from their depot" in capsys.readouterr().err
+    assert read_results(tmp_path / "out")[0]["objective"] == "1.0"

@@ -112,6 +112,14 @@ def run_evaluate(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise ValueError(f"--seed is {args.seed}; it must be at least 0.")
     instances = load_instances(args.instances)
+    for name, batch in instances.items():
+        n_real, n_reachable = int(batch.task_mask.sum()), int(batch.reachable().sum())
+        if n_reachable < n_real:
+            print(
+                f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks lie farther than max_distance / 2 from their depot; "
+                "no schedule can visit them.",
+                file=sys.stderr,
+            )
     solvers = make_solvers(args)
     summary = evaluate(solvers, instances, args.out, args.seed, progress=lambda line: print(line, file=sys.stderr, flush=True))
     print_table(summary)
