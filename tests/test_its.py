@@ -1,4 +1,5 @@
 import csv
+import itertools
 import json
 from typing import Any
 
@@ -17,6 +18,8 @@ from sb3_uav.training import Freezer, ITSCallback
 from sb3_uav.training.its import CHECKPOINT_FOLDER, LOG_FILE, read_state
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 
+pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
+
 SMALL: dict[str, Any] = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
 PAPER: dict[str, Any] = dict(SMALL, preset="paper")
 N_TASKS, N_UAVS, N_ENVS = 5, 2, 4
@@ -34,11 +37,9 @@ def make_allocator(n_uavs: int = N_UAVS, **kwargs) -> Any:
 
 
 def make_its(router: dict | None = None, **kwargs) -> Any:
-    router_settings: dict[str, Any] = dict(
-        policy="RouterPolicy", n_envs=4, learning_rate=1e-2, policy_kwargs=SMALL, **(router or {})
-    )
+    default_router: dict[str, Any] = dict(policy="RouterPolicy", n_envs=4, learning_rate=1e-2, policy_kwargs=SMALL)
     settings: dict[str, Any] = dict(n_epochs=6, n_pretraining_epochs=2, n_intensive_epochs=4, n_continuous_epochs=2)
-    return ITSCallback(router_settings, **{**settings, **kwargs})
+    return ITSCallback({**default_router, **(router or {})}, **{**settings, **kwargs})
 
 
 def learn(model: REINFORCE, its: ITSCallback, *others: BaseCallback) -> Any:
@@ -257,7 +258,7 @@ def test_zips_and_log_are_left_in_the_folder(tmp_path):
     assert list(rows[0]) == ["epoch", "level", "phase", "n_instances", "objective", "seconds"]
     assert all(0 <= float(row["objective"]) <= N_TASKS and int(row["n_instances"]) == 8 for row in rows)
     folder = tmp_path / CHECKPOINT_FOLDER
-    assert sorted(path.name for path in folder.iterdir()) == ["allocator_6.zip", "its_state.json", "router_6.zip"]
+    assert sorted(path.name for path in folder.iterdir()) == ["allocator_6.zip", "its_state.json", "router_8.zip"]
     assert REINFORCE.load(folder / "allocator_6.zip").epoch == 6
     # The zips give feasible schedules.
     instances = model.draw_batch(0)
@@ -284,7 +285,7 @@ class Interrupt(BaseCallback):
 def test_resumed_run_equals_an_unbroken_one(baseline, epochs, tmp_path):
     """Interrupted in any phase, after pre-training included: allocator, router and log go on as if nothing had happened."""
     settings: dict[str, Any] = dict(baseline=baseline, policy_kwargs=PAPER, lr_decay=0.9)
-    router: dict[str, Any] = dict(baseline=baseline, lr_decay=0.9)
+    router: dict[str, Any] = dict(baseline=baseline, lr_decay=0.9, policy_kwargs=PAPER)
     if baseline == "rollout":
         settings["baseline_kwargs"] = router["baseline_kwargs"] = dict(n_test_instances=20)
     unbroken, its = make_allocator(**settings), make_its(router)
@@ -310,10 +311,10 @@ def test_interrupted_during_the_router_keeps_the_last_checkpoint(tmp_path, monke
     its = make_its(save_path=str(tmp_path))
     original = ITSCallback._train_router
 
-    def interrupted(self, n_epochs, phase):
+    def interrupted(self, n_epochs, phase, first=0):
         if phase == "alternate":
             raise KeyboardInterrupt
-        original(self, n_epochs, phase)
+        original(self, n_epochs, phase, first)
 
     monkeypatch.setattr(ITSCallback, "_train_router", interrupted)
     model = make_allocator()
@@ -323,6 +324,92 @@ def test_interrupted_during_the_router_keeps_the_last_checkpoint(tmp_path, monke
     # rl_zoo3 calls this after Ctrl-C; it must not start the router's training again.
     its.on_training_end()
     assert trace(its).endswith("a") and all(p.requires_grad for p in model.policy.parameters())
+
+
+def test_resumed_in_pretraining_equals_an_unbroken_run(tmp_path, monkeypatch):
+    unbroken, its = make_allocator(), make_its(n_pretraining_epochs=3)
+    learn(unbroken, its)
+    original = ITSCallback._learn_router
+
+    def interrupted(self, number, *args):
+        if number == 3:
+            raise KeyboardInterrupt
+        return original(self, number, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ITSCallback, "_learn_router", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            learn(make_allocator(), make_its(n_pretraining_epochs=3, save_path=str(tmp_path)))
+    folder = tmp_path / CHECKPOINT_FOLDER
+    state = read_state(folder)
+    assert (state["epoch"], state["router"], len(state["records"])) == (0, "router_2.zip", 2)
+    resumed = REINFORCE.load(folder / state["allocator"], env=make_env())
+    resumed_its = make_its(n_pretraining_epochs=3, save_path=str(tmp_path), resume_from=str(folder))
+    learn(resumed, resumed_its)
+    assert trace(resumed_its) == trace(its)
+    assert equal(unbroken.policy.state_dict(), resumed.policy.state_dict())
+    assert equal(its.router.policy.state_dict(), resumed_its.router.policy.state_dict())
+
+
+def test_pretraining_leaves_the_allocator_alone():
+    model = make_allocator(policy_kwargs=PAPER)
+    start = snapshot(model.policy)
+    its = make_its(n_epochs=1, strategy="independent")
+    seed = th.initial_seed()
+
+    class Compare(BaseCallback):
+        def _on_training_start(self) -> None:
+            assert trace(its) == "pp" and equal(start, self.model.policy.state_dict())
+            # Nor is the run's global random state touched by making the router.
+            assert th.initial_seed() == seed
+
+        def _on_step(self) -> bool:
+            return True
+
+    learn(model, its, Compare())
+    assert not equal(start, model.policy.state_dict())
+
+
+def test_models_can_go_on_learning_afterwards():
+    """Neither a limit nor frozen parameters stay behind."""
+    model, its = make_allocator(), make_its(n_epochs=2)
+    learn(model, its)
+    assert model.max_instances is None
+    model.learn_instances(8)
+    its.router.learn_instances(8)
+    assert model.n_instances == 24
+    # A limit of the caller binds too.
+    model, its = make_allocator(), make_its()
+    model.learn_instances(16, its)
+    assert trace(its) == "pp" + "aaii" and model.n_instances == 16
+
+
+def test_foreign_files_in_the_checkpoint_folder_stay(tmp_path):
+    folder = tmp_path / CHECKPOINT_FOLDER
+    folder.mkdir()
+    (folder / "mine.zip").write_text("not yours")
+    learn(make_allocator(), make_its(n_epochs=1, save_path=str(tmp_path)))
+    assert {"mine.zip", "allocator_1.zip"} <= {path.name for path in folder.iterdir()}
+
+
+def test_says_when_nothing_is_saved():
+    with pytest.warns(UserWarning, match="ITSCallback saves no router: set save_path to a folder"):
+        learn(make_allocator(), make_its(n_epochs=1))
+
+
+def test_router_zip_is_current_between_checkpoints(tmp_path):
+    its = make_its(save_path=str(tmp_path), checkpoint_freq=4)
+    make_allocator().learn(3 * 8 * N_TASKS, callback=its)
+    assert equal(REINFORCE.load(tmp_path / "router.zip").policy.state_dict(), its.router.policy.state_dict())
+    assert read_state(tmp_path / CHECKPOINT_FOLDER)["epoch"] == 0
+
+
+def test_best_router_when_the_last_evaluation_is_the_best(tmp_path):
+    """The last call of on_step may be the one that finds the best allocator."""
+    evaluation = EvalCallback(make_env(2), n_eval_episodes=4, eval_freq=20, best_model_save_path=str(tmp_path), verbose=0)
+    its = make_its(n_epochs=2)
+    make_allocator().learn(2 * 8 * N_TASKS, callback=[its, evaluation])
+    assert (tmp_path / "best_model.zip").is_file() and (tmp_path / "best_router.zip").is_file()
 
 
 def test_best_router_is_kept_with_the_best_allocator(tmp_path):
@@ -337,16 +424,26 @@ def test_best_router_is_kept_with_the_best_allocator(tmp_path):
 
 @pytest.mark.parametrize("algo", ["ppo", "ppo_mask", "a2c"])
 def test_router_of_another_algorithm(algo):
-    """Any on-policy algorithm of SB3 can be the router's."""
-    router: dict[str, Any] = dict(algo=algo, n_steps=8, baseline=None)
-    router.pop("baseline")
+    """Any on-policy algorithm of SB3 can be the router's, and learns in every epoch, however long its rollouts are."""
+    router: dict[str, Any] = dict(algo=algo, n_steps=64)
     if algo != "a2c":
         router.update(batch_size=16, n_epochs=1)
     its = make_its(router, n_epochs=2, n_pretraining_epochs=1, n_intensive_epochs=0)
+    snapshots = []
+
+    original = its._learn_router
+
+    def learn_router(*args):
+        snapshots.append(snapshot(its.router.policy))
+        return original(*args)
+
+    its._learn_router = learn_router
     learn(make_allocator(), its)
     assert trace(its) == "p" + "at" * 2
-    assert its.router.num_timesteps > 3 * 8
-    assert all(0 < record.objective <= N_TASKS for record in its.records)
+    snapshots.append(snapshot(its.router.policy))
+    assert len(snapshots) == 4 and not any(equal(a, b) for a, b in itertools.pairwise(snapshots))
+    assert its.router._n_updates >= 3
+    assert all(0 < record.objective <= N_TASKS and record.n_instances >= 8 for record in its.records)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, MaskablePPO])
@@ -355,8 +452,14 @@ def test_allocator_of_another_algorithm(algorithm):
         AllocatorPolicy, make_env(), n_steps=N_TASKS, batch_size=10, n_epochs=1, policy_kwargs=SMALL, seed=0, device="cpu"
     )
     its = make_its(n_epochs=3, n_pretraining_epochs=1, n_intensive_epochs=2, instances_per_epoch=8)
+    # SB3 counts steps from 0 again in every call of learn.
+    model.learn(8 * N_TASKS, callback=its)
+    assert trace(its) == "pa"
     model.learn(10**6, callback=its)
     assert trace(its) == "p" + "aaii" + "at"
+    assert [record.n_instances for record in its.records if record.level == "allocator"] == [8, 8, 8]
+    with pytest.raises(ValueError, match="The allocator has been trained before"):
+        model.learn(8, callback=make_its(instances_per_epoch=8))
 
 
 def test_its_writes_tensorboard_for_both_levels(tmp_path):
@@ -392,6 +495,8 @@ def test_bad_arguments_are_named(kwargs, message):
         (dict(learnin_rate=1), "these arguments do not fit algorithm 'reinforce'.*learnin_rate"),
         (dict(algo="reinforced"), "algo is 'reinforced'; choose one of reinforce, ppo"),
         (dict(algo="stable_baselines3.SAC"), "is not an on-policy algorithm"),
+        (dict(n_envs=0), "n_envs is 0; it must be a whole number of at least 1"),
+        (dict(learning_rate="lin_0.1"), "learning_rate is 'lin_0.1'; write a number"),
     ],
 )
 def test_bad_router_is_named(router, message):
@@ -420,6 +525,9 @@ def test_damaged_checkpoints_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"its_state.json: no such file; give the its_checkpoint folder"):
         read_state(tmp_path)
     (tmp_path / "its_state.json").write_text('{"epoch": 3')
+    with pytest.raises(ValueError, match="not an intact state file"):
+        read_state(tmp_path)
+    (tmp_path / "its_state.json").write_text(json.dumps(dict(epoch=3, records=[dict(epoch=1)])))
     with pytest.raises(ValueError, match="not an intact state file"):
         read_state(tmp_path)
     (tmp_path / "its_state.json").write_text(json.dumps(dict(epoch=3)))

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_uav.envs import (
     BatchedVecEnv,
@@ -109,9 +109,10 @@ def test_allocator_learns_to_split():
 # ------------------------------------------------------------------------------------------ the gradient
 
 
-def test_loss_is_the_papers():
+@pytest.mark.parametrize("baseline", ["none", "exponential", "shared", "rollout"])
+def test_loss_is_the_papers(baseline):
     """mean((baseline - return) * sum of log-probabilities), by hand on one batch."""
-    model = make_model(baseline="none")
+    model = make_model(baseline=baseline)
     gradients = {}
 
     class Spy(BaseCallback):
@@ -119,7 +120,8 @@ def test_loss_is_the_papers():
             algorithm: Any = self.model
             batch = algorithm._batch
             evaluation = algorithm.policy.evaluate_episodes(batch.instances, batch.actions)
-            loss = (-batch.returns.float() * evaluation.log_prob.sum(-1)).mean()
+            mean = {"none": 0.0, "shared": batch.returns.mean(1, keepdim=True)}.get(baseline, batch.returns.mean())
+            loss = ((mean - batch.returns).float() * evaluation.log_prob.sum(-1)).mean()
             gradients["expected"] = th.autograd.grad(loss, algorithm.policy.action_net.weight)[0]
 
         def _on_step(self) -> bool:
@@ -339,7 +341,9 @@ def test_a_callback_can_stop_the_training():
 def test_eval_callback_and_predict(tmp_path):
     env = make_env()
     callback = EvalCallback(make_env(n_envs=2), n_eval_episodes=4, eval_freq=18, log_path=str(tmp_path), verbose=0)
-    make_model(env=env).learn(4 * 6 * 3 * 2, callback=CallbackList([callback]))
+    model = make_model(env=env).learn(4 * 6 * 3 * 2, callback=CallbackList([callback]))
+    actions, _ = model.predict(env.reset(), deterministic=True)
+    assert actions.shape == (4,) and env.action_masks()[np.arange(4), actions].all()
     assert np.load(tmp_path / "evaluations.npz")["results"].shape == (2, 4)
 
 
@@ -390,7 +394,10 @@ def test_advantages_of_the_step_loop_by_hand():
     [
         (dict(baseline="rolout"), "baseline is 'rolout'; choose one of"),
         (dict(baseline="shared", n_samples=1), "set n_samples to at least 2"),
-        (dict(n_samples=0), "n_samples is 0; it must be at least 1"),
+        (dict(n_samples=0), "n_samples is 0; it must be a whole number of at least 1"),
+        (dict(n_samples=1.5), "n_samples is 1.5; it must be a whole number"),
+        (dict(lr_decay=-1), "lr_decay is -1; it must be above 0"),
+        (dict(baseline="rollout", baseline_kwargs=dict(alpha=2)), "alpha is 2; a significance level lies between 0 and 1"),
         (dict(instances_per_epoch=0), "instances_per_epoch is 0"),
         (dict(baseline="exponential", baseline_kwargs=dict(beta=1.5)), "beta of the exponential baseline is 1.5"),
         (dict(baseline="exponential", baseline_kwargs=dict(bet=0.5)), "do not fit baseline 'exponential'"),
@@ -400,6 +407,48 @@ def test_advantages_of_the_step_loop_by_hand():
 def test_bad_arguments_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_model(**kwargs)
+
+
+def test_a_single_advantage_is_no_division_by_zero():
+    model = make_model(baseline="none", env=make_env(n_envs=1), n_samples=1, normalize_advantage=True).learn_instances(3)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
+def test_continuous_actions_are_refused():
+    with pytest.raises(AssertionError, match=r"only supports.*Discrete"):
+        REINFORCE("MlpPolicy", "Pendulum-v1")
+
+
+@pytest.mark.parametrize(("before", "after"), [("rollout", "shared"), ("shared", "rollout")])
+def test_another_baseline_after_loading(before, after, tmp_path):
+    """A new rollout baseline starts as a copy of the policy."""
+    model = make_model(baseline=before).learn_instances(8)
+    model.save(tmp_path / "model")
+    loaded: Any = REINFORCE.load(tmp_path / "model", env=make_env(), baseline=after, baseline_kwargs={})
+    if after == "rollout":
+        loaded._baseline.n_test_instances = 8
+        for mine, copied in zip(loaded.policy.parameters(), loaded.baseline_policy.parameters(), strict=True):
+            assert th.equal(mine, copied)
+    assert loaded.learn_instances(8).n_instances == 16
+
+
+def test_environment_can_be_set_after_loading_and_be_larger(tmp_path):
+    model = make_model().learn_instances(8)
+    model.save(tmp_path / "model")
+    loaded = REINFORCE.load(tmp_path / "model")
+    loaded.set_env(make_env())
+    assert loaded.learn_instances(8).n_instances == 16
+    larger = REINFORCE.load(tmp_path / "model", env=make_env(n_envs=12))
+    assert larger.learn_instances(12).n_instances == 20
+
+
+def test_rows_that_differ_leave_sb3s_loop():
+    """One row of a DummyVecEnv cannot stand for others with another D."""
+    alike = DummyVecEnv([lambda: TaskAllocationEnv(6, 2, max_distance=1.2)] * 2)
+    distances = iter((0.5, 3.0))
+    mixed = DummyVecEnv([lambda: TaskAllocationEnv(6, 2, max_distance=next(distances))] * 2)
+    assert make_model(baseline="none", env=alike).problem is not None
+    assert make_model(baseline="none", env=mixed).problem is None
 
 
 def test_replaying_baselines_are_refused_elsewhere():

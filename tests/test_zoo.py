@@ -13,7 +13,7 @@ import yaml
 from stable_baselines3.common.results_plotter import load_results
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv
+from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id
@@ -24,7 +24,7 @@ from sb3_uav.training.its import read_state
 pytest.importorskip("rl_zoo3")
 from sb3_uav.zoo import cli, enjoy, train
 from sb3_uav.zoo.demo import evaluate_run, newest_run
-from sb3_uav.zoo.experiment import default_config, parse_schedule
+from sb3_uav.zoo.experiment import default_config, parse_schedule, plain_numbers
 
 ENV = "TaskAllocation-U3-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
@@ -142,6 +142,42 @@ def test_resumed_run_equals_an_unbroken_one(trained, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_final_zip_continues_too(trained, tmp_path, capsys):
+    """`-i` with the zip that the zoo saves last finds the checkpoint below it."""
+    config = write_config(tmp_path, **its_with(n_epochs=4))
+    final = run_folder(trained) / f"{ENV}.zip"
+    assert run(tmp_path, config, "-i", str(final), "-n", str(EPOCH), "--eval-freq", "-1") == 0
+    assert read_state(run_folder(tmp_path) / "its_checkpoint")["epoch"] == 4
+    lonely = tmp_path / "lonely.zip"
+    lonely.write_bytes(final.read_bytes())
+    assert run(tmp_path, config, "-i", str(lonely), "-n", str(EPOCH)) == 2
+    assert "holds its_state.json, which knows its router" in capsys.readouterr().err
+    assert run(tmp_path, config, "-i", str(tmp_path / "none.zip")) == 2
+    assert "none.zip: no such file; give the zip of a trained agent" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_evaluation_happens_once_per_epoch_on_other_instances(tmp_path):
+    """If the command line does not say how often; and the first training instances are not the first evaluated ones."""
+    config = write_config(tmp_path)
+    config.write_text(config.read_text().replace("sb3_uav.training.ITSCallback", f"{__name__}.Instances"))
+    assert run(tmp_path, config, "--eval-episodes", "2") == 0
+    assert np.load(run_folder(tmp_path) / "evaluations.npz")["timesteps"].tolist() == [160, 320, 480]
+    training, evaluation = (set(map(tuple, depots)) for depots in Instances.depots)
+    assert not training & evaluation
+
+
+@pytest.mark.slow
+def test_help_and_optimize(capsys):
+    for main in (train.main, enjoy.main):
+        with pytest.raises(SystemExit) as done:
+            main(["--help"])
+        assert done.value.code == 0 and "--algo" in capsys.readouterr().out
+    assert train.main(["--env", ENV, "-optimize"]) == 2
+    assert "-optimize has no search space for reinforce yet" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_demo_files_from_a_run(trained, tmp_path, capsys):
     assert evaluate_run(run_folder(trained), ENV, tmp_path, 5, 0) == 0
     for name in ("results/results.csv", "results/schedules.jsonl", "learning_curves.png", "schedule.png", "instances.npz"):
@@ -155,6 +191,18 @@ def test_demo_files_from_a_run(trained, tmp_path, capsys):
     mean = {name: np.mean([float(row["objective"]) for row in rows if row["solver"] == name]) for name in solvers}
     gain = mean["DL-DRL (sampling 128)"] - mean["random-nearest"]
     assert f"DL-DRL (sampling 128) against random-nearest: {gain:+.2f} tasks" in printed
+
+
+class Instances(ITSCallback):
+    """Notes the instances that training and evaluation environments begin with."""
+
+    depots: Any = None
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        evaluation = self.locals["callback"].callbacks[-1].eval_env
+        environments: list[Any] = [self.training_env, evaluation]
+        type(self).depots = [env.reset()["depot"].tolist() for env in environments]
 
 
 class Spy(ITSCallback):
@@ -227,6 +275,8 @@ def its_with(**changes: Any) -> dict[str, Any]:
         (dict(policy_kwargs=dict(preset="papper")), "preset is 'papper'"),
         (its_with(n_epoch=3), "an argument of 'callback' does not fit"),
         (its_with(strategy="none"), "strategy is 'none'"),
+        (dict(policy_kwargs=dict(embed_dims=8)), "unexpected keyword argument 'embed_dims'"),
+        (dict(policy="sb3_uav.policies.AlocatorPolicy"), "AlocatorPolicy"),
         (its_with(router=dict(policy="RouterPolicy", n_stepz=3)), "these arguments do not fit algorithm 'reinforce'"),
     ],
 )
@@ -299,6 +349,23 @@ def test_shipped_settings_are_the_papers(n_uavs, n_tasks):
     assert (router["learning_rate"], router["max_grad_norm"], router["n_envs"]) == (1e-4, 1.0, batch)
     assert router["baseline"] == "rollout" and router.get("lr_decay", 1.0) == 1.0
     assert router["policy_kwargs"] == {"preset": "paper"}
+
+
+def test_shipped_routers_build():
+    env = BatchedVecEnv([lambda: RoutePlanningEnv(20)] * 2)
+    callbacks = [entry["callback"][0] for entry in shipped().values() if "callback" in entry]
+    routers = [callback["sb3_uav.training.ITSCallback"]["router"] for callback in callbacks]
+    assert len(routers) == 12 + 4 + 1
+    for router in routers:
+        settings = {key: value for key, value in router.items() if key not in ("algo", "n_envs", "policy")}
+        assert router["algo"] == "reinforce" and router["policy"] == "RouterPolicy"
+        REINFORCE("RouterPolicy", env, device="cpu", **settings)
+
+
+def test_texts_become_numbers():
+    """YAML 1.1 takes 1e-3 for a text; rl_zoo3 stops at it, and our nested router would too."""
+    given = {"a": "1e-3", "b": [{"c": "2.5e2", "d": "1e3x"}], "policy": "MlpPolicy", "e": "lin_1e-3", "f": 3}
+    assert plain_numbers(given) == {"a": 0.001, "b": [{"c": 250, "d": "1e3x"}], "policy": "MlpPolicy", "e": "lin_1e-3", "f": 3}
 
 
 @pytest.mark.parametrize("name", [ENV, "RoutePlanning-N20-v0"])

@@ -41,6 +41,9 @@ class AllocatorExtractor(EpisodicExtractor):
     :param use_values: Whether task values are features of the encoder
     """
 
+    environment = "TaskAllocation"
+    own_key = "assignment"
+
     def __init__(
         self,
         observation_space: spaces.Space,

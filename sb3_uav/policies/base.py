@@ -86,10 +86,19 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     :param encoder_kwargs: Arguments of :class:`~sb3_uav.policies.encoder.AttentionEncoder`
     """
 
+    # Which environment it is for, and an observation key that only this one has.
+    environment: ClassVar[str]
+    own_key: ClassVar[str]
+
     def __init__(self, observation_space: spaces.Space, features_dim: int, **encoder_kwargs: Any) -> None:
         if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
             raise ValueError(
                 f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}."
+            )
+        if self.own_key not in observation_space.spaces:
+            raise ValueError(
+                f"{type(self).__name__} needs the observation of a {self.environment} environment, but its keys "
+                f"{sorted(observation_space.spaces)} lack {self.own_key!r}; use the policy of the other level."
             )
         super().__init__(observation_space, features_dim)
         self.encoder = AttentionEncoder(**encoder_kwargs)
@@ -141,7 +150,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         if self.training or th.is_grad_enabled() or not self.use_cache:
             return self.encode(static)
         if self._cached is None or self._cached[0].tasks.shape != static.tasks.shape:
-            cache = self.encode(static)
+            rows, cache = None, self.encode(static)
         else:
             known, cache = self._cached
             changed = th.stack([(old != new).flatten(1).any(1) for old, new in zip(known, static, strict=True)]).any(0)
@@ -150,7 +159,9 @@ class EpisodicExtractor(BaseFeaturesExtractor):
                 cache = self.encode(static)
             elif len(rows) > 0:
                 cache = cache.update_rows(rows, self.encode(StaticObservation(*(field[rows] for field in static))))
-        self._cached = (static, cache)
+        if rows is None or len(rows) > 0:
+            # A copy, because an environment may write its next observation into the same memory.
+            self._cached = (StaticObservation(*(field.clone() for field in static)), cache)
         return cache
 
     def clear_cache(self) -> None:
@@ -287,7 +298,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :param n_subsets: Into how many subsets each is going to be split at once
         :return: How many instances this policy can treat at once, at least 1
         """
-        return rows_that_fit(self.device, self.features_extractor.encoder.n_heads, n_nodes, n_subsets)
+        return rows_that_fit(self.device, n_nodes, n_subsets)
 
     # ---------------------------------------------------------------------------------------------------- decoding
 
@@ -349,8 +360,11 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :param cache: The encodings, if there are any already
         :return: Actions ``(batch, n_samples, n_steps)`` int64
         """
-        cache = self.encode(instances) if cache is None else cache.detach()
-        return self._decode_episodes(instances, cache, n_samples, deterministic, generator)
+        if cache is None:
+            # As predict does; a caller that trains brings the encodings along.
+            self.set_training_mode(False)
+            cache = self.encode(instances)
+        return self._decode_episodes(instances, cache.detach(), n_samples, deterministic, generator)
 
     def evaluate_episodes(self, instances: Instances, actions: th.Tensor, cache: Cache | None = None) -> EpisodeEvaluation:
         """

@@ -163,8 +163,8 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     :param attention_bias: Added to the scores, broadcast against ``(batch, n_heads, n_queries, n_nodes)``, or None
     :return: ``(batch, n_queries, embed_dim)``
     """
-    heads = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
-    return functional.scaled_dot_product_attention(*heads, attn_mask=attention_bias).transpose(1, 2).flatten(2)
+    query, key, value = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
+    return functional.scaled_dot_product_attention(query, key, value, attn_mask=attention_bias).transpose(1, 2).flatten(2)
 
 
 class AttentionLayer(nn.Module):
@@ -218,7 +218,6 @@ class AttentionEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.use_values = use_values
-        self.n_heads = n_heads
         self.embed_depot = nn.Linear(2, embed_dim)
         self.embed_task = nn.Linear(3 if use_values else 2, embed_dim)
         self.layers = nn.ModuleList(AttentionLayer(embed_dim, n_heads, ff_dim, normalization) for _ in range(n_layers))

@@ -6,23 +6,22 @@ import torch as th
 
 # What one pass may take on a CPU, in bytes. More is not faster there.
 CPU_MEMORY = 2**30
-# What encoder and decoder take per node beside the attention weights: about 1,000 float32 in a default network, four times.
+# What encoder and decoder take per node: about 1,000 float32 in a default network, four times.
 NODE_MEMORY = 2**14
 # What splitting takes per task, sample and UAV: coordinates and indices in float64 and int64, and their copies.
 SPLIT_MEMORY = 48
 
 
-def rows_that_fit(device: th.device, n_heads: int, n_nodes: int, n_subsets: int = 0) -> int:
+def rows_that_fit(device: th.device, n_nodes: int, n_subsets: int = 0) -> int:
     """
     :param device: Where they are encoded
-    :param n_heads: Heads of the encoder
     :param n_nodes: Nodes of each instance, the depot included
     :param n_subsets: Into how many subsets each is going to be split at once
     :return: How many instances can be treated at once, at least 1
     """
     memory = CPU_MEMORY
     if device.type == "cuda":
-        memory = th.cuda.mem_get_info(device)[0] // 4
-    # Scores, scores with the bias of padded nodes, and weights live at the same time, in float32.
-    per_node = 3 * 4 * n_heads * n_nodes + NODE_MEMORY + SPLIT_MEMORY * n_subsets
-    return max(memory // (n_nodes * per_node), 1)
+        kept = th.cuda.memory_reserved(device) - th.cuda.memory_allocated(device)
+        memory = (th.cuda.mem_get_info(device)[0] + kept) // 4
+    # Linear in the nodes: torch's fused attention does not hold the matrix of scores.
+    return max(memory // (n_nodes * (NODE_MEMORY + SPLIT_MEMORY * n_subsets)), 1)

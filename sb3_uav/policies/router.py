@@ -48,6 +48,9 @@ class RouterExtractor(EpisodicExtractor):
     :param use_values: Whether task values are features of the encoder
     """
 
+    environment = "RoutePlanning"
+    own_key = "position"
+
     def __init__(
         self,
         observation_space: spaces.Space,

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from sb3_uav.reinforce.reinforce import REINFORCE
 
 
+# How many test instances are decoded at once: the smaller of the paper's batches.
+TEST_ROWS = 256
+
+
 class Baseline(ABC):
     """
     A baseline of returns.
@@ -146,6 +150,8 @@ class RolloutBaseline(Baseline):
         super().__init__(model)
         if n_test_instances < 2:
             raise ValueError(f"n_test_instances is {n_test_instances}; a paired t-test needs at least 2.")
+        if not 0 < alpha < 1:
+            raise ValueError(f"alpha is {alpha}; a significance level lies between 0 and 1.")
         self.warmup = ExponentialBaseline(model, beta)
         self.warmup_epochs = warmup_epochs
         self.n_test_instances = n_test_instances
@@ -163,7 +169,7 @@ class RolloutBaseline(Baseline):
         draw = getattr(problem.generator, "held_out", problem.generator)
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
         gains = []
-        for rows in th.arange(len(instances)).split(1024):
+        for rows in th.arange(len(instances)).split(TEST_ROWS):
             part = instances[rows].to(self.model.device)
             gains.append((greedy_returns(policy, problem, part) - greedy_returns(copy, problem, part)).cpu())
         gain = th.cat(gains).flatten().numpy()

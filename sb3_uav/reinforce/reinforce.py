@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -76,12 +77,13 @@ class REINFORCE(OnPolicyAlgorithm):
         ``"rollout"`` (the paper's)
     :param baseline_kwargs: Arguments of the baseline, see :mod:`sb3_uav.reinforce.baselines`
     :param instances_per_epoch: Instances per epoch; after each the rollout baseline is tested and the learning rate decays
-    :param lr_decay: Factor of the learning rate per epoch
+    :param lr_decay: Factor of the learning rate per epoch (fused driver)
     :param gamma: Discount factor (SB3's loop; the fused driver does not discount)
     :param ent_coef: Entropy coefficient for the loss calculation
     :param vf_coef: Value function coefficient for the loss calculation (baseline ``critic``)
     :param max_grad_norm: The maximum value for the gradient clipping
-    :param normalize_advantage: Whether to divide advantages by their standard deviation
+    :param normalize_advantage: Whether to divide advantages by their standard deviation (SB3's loop, like SB3's A2C, also
+        subtracts their mean)
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
@@ -144,6 +146,7 @@ class REINFORCE(OnPolicyAlgorithm):
             verbose=verbose,
             seed=seed,
             device=device,
+            supported_action_spaces=(spaces.Discrete,),
             _init_setup_model=False,
         )
         self.n_samples = n_samples
@@ -169,8 +172,11 @@ class REINFORCE(OnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         for name in ("n_samples", "instances_per_epoch", "n_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1.")
+        if not self.lr_decay > 0:
+            raise ValueError(f"lr_decay is {self.lr_decay}; it must be above 0.")
         if self.baseline not in BASELINES:
             raise ValueError(f"baseline is {self.baseline!r}; choose one of {sorted(BASELINES)}.")
         if self.baseline == "shared" and self.n_samples < 2:
@@ -344,24 +350,32 @@ class REINFORCE(OnPolicyAlgorithm):
 
     def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
         """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
-        assert isinstance(self.policy, EpisodicPolicy)
+        assert isinstance(self.policy, EpisodicPolicy) and self.problem is not None
         evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
-        advantages = (batch.returns - batch.baseline).float()[..., None]
+        advantages = (batch.returns - batch.baseline).float()
         value_loss = None
         if self.baseline == "critic":
-            # The value of what is still to come, which for a terminal reward is the return itself.
-            to_go = self._rewards_to_go(batch)
-            value_loss = ((to_go - evaluation.values) ** 2).mean()
-            advantages = to_go - evaluation.values.detach()
-            self.logger.record(
-                "train/explained_variance",
-                float(explained_variance(evaluation.values.detach().flatten().cpu().numpy(), to_go.flatten().cpu().numpy())),
-            )
-        if self.normalize_advantage:
-            advantages = advantages / (advantages.std() + 1e-8)
-        policy_loss = -(advantages * evaluation.log_prob).sum(-1).mean()
-        self.logger.record("train/baseline", batch.baseline.mean().item())
+            # Steps after the end of an episode belong to nobody.
+            lengths = self.problem.lengths(batch.instances, batch.actions)
+            real = th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
+            to_go, values = self._rewards_to_go(batch)[real], evaluation.values[real]
+            value_loss = ((to_go - values) ** 2).mean()
+            advantages = to_go - values.detach()
+            variance = explained_variance(values.detach().cpu().numpy(), to_go.cpu().numpy())
+            self.logger.record("train/explained_variance", float(variance))
+            weighted = th.zeros_like(evaluation.log_prob)
+            weighted[real] = self._normalized(advantages) * evaluation.log_prob[real]
+        else:
+            self.logger.record("train/baseline", batch.baseline.mean().item())
+            weighted = self._normalized(advantages)[..., None] * evaluation.log_prob
+        policy_loss = -weighted.sum(-1).mean()
         return self._total_loss(policy_loss, evaluation.entropy.sum(-1).mean(), value_loss)
+
+    def _normalized(self, advantages: th.Tensor) -> th.Tensor:
+        # A single advantage has no standard deviation, and would turn all weights to NaN.
+        if not self.normalize_advantage or advantages.numel() < 2:
+            return advantages
+        return advantages / (advantages.std() + 1e-8)
 
     def _rewards_to_go(self, batch: EpisodeBatch) -> th.Tensor:
         """``(batch, n_samples, n_steps)`` float32: what each step's action and those after it collect."""
@@ -412,16 +426,16 @@ class REINFORCE(OnPolicyAlgorithm):
         callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str = "REINFORCE",
-        progress_bar: bool = False,
     ) -> SelfREINFORCE:
         """
         Go on learning for a number of instances, whatever the number of steps they take (fused driver only).
+
+        Learning rate schedules do not advance meanwhile, because the number of steps to come is not known; ``lr_decay`` does.
 
         :param n_instances: How many more instances to learn from, rounded up to whole batches
         :param callback: callback(s) called at every step
         :param log_interval: Log the training every ``log_interval`` updates
         :param tb_log_name: the name of the run for TensorBoard logging
-        :param progress_bar: Display a progress bar
         :return: the trained model
         :raises ValueError: If policy and environment leave only SB3's step loop
         """
@@ -429,10 +443,21 @@ class REINFORCE(OnPolicyAlgorithm):
             raise ValueError("learn_instances needs a sb3_uav policy on a sb3_uav environment; use learn here.")
         self.max_instances = self.n_instances + n_instances
         try:
-            limit = NO_STEP_LIMIT - self.num_timesteps
-            return self.learn(limit, callback, log_interval, tb_log_name, False, progress_bar)
+            is_new = self.num_timesteps == 0
+            return self.learn(NO_STEP_LIMIT - self.num_timesteps, callback, log_interval, tb_log_name, is_new)
         finally:
             self.max_instances = None
+
+    def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        if isinstance(load_path_or_dict, dict):
+            # A model may go on with another baseline than it was saved with.
+            parameters = dict(load_path_or_dict)
+            if self.baseline != "rollout":
+                parameters.pop("baseline_policy", None)
+            elif "policy" in parameters:
+                parameters.setdefault("baseline_policy", parameters["policy"])
+            load_path_or_dict = parameters
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save(
         self,
@@ -462,6 +487,10 @@ def find_problem(env: VecEnv) -> Problem | None:
     if isinstance(env, BatchedVecEnv):
         return env.problem
     if isinstance(env, DummyVecEnv):
-        problem_env = unwrap_problem_env(env.envs[0])
-        return None if problem_env is None else problem_env.problem
+        problem_envs = [unwrap_problem_env(row) for row in env.envs]
+        problems = [row.problem for row in problem_envs if row is not None]
+        # One problem stands for all rows only if all rows have the same instances and rewards.
+        kinds = [(problem.generator, getattr(problem, "router", None)) for problem in problems]
+        if len(problems) == len(problem_envs) and all(kind == kinds[0] for kind in kinds):
+            return problems[0]
     return None

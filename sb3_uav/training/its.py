@@ -6,14 +6,19 @@ import csv
 import io
 import json
 import os
+import random
+import re
 import time
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import (
@@ -22,10 +27,9 @@ from stable_baselines3.common.callbacks import (
     EvalCallback,
     EventCallback,
     ProgressBarCallback,
-    StopTrainingOnMaxEpisodes,
     tqdm,
 )
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
@@ -34,7 +38,7 @@ from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.reinforce.reinforce import NO_STEP_LIMIT, find_problem
+from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
 from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, random_stream
 from sb3_uav.training.freezing import Freezer
@@ -142,8 +146,11 @@ class ITSCallback(BaseCallback):
     Before the allocator's training the router learns on whole uniform instances (pre-training). Up to allocator epoch
     ``n_intensive_epochs`` it learns for ``n_continuous_epochs`` epochs after every ``n_continuous_epochs``-th one, on the
     shuffled subsets of that epoch's instances (intensive training); after that for one epoch after every one, on a random V-th
-    part of them (alternate training). Allocator and router are saved at every epoch's end, and a run goes on from there with
-    the same result as if it had not been interrupted.
+    part of them (alternate training).
+
+    The router is saved after each of its epochs, and a checkpoint of both levels after each epoch of pre-training and every
+    ``checkpoint_freq``-th one of the allocator. With ``REINFORCE`` and constant learning rates (``lr_decay`` included) a run
+    goes on from its checkpoint with the same result as if it had not been interrupted.
 
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
@@ -212,7 +219,10 @@ class ITSCallback(BaseCallback):
         self._epoch_start = 0.0
         self._epoch_first_batch = 0
         self._instances_at_start = 0
-        self._best_mean_reward = -np.inf
+        self._best_mean_reward: dict[str, float] = {}
+        self._instances_before = 0
+        self._steps_before = 0
+        self._callers_limit: int | None = None
 
     # ------------------------------------------------------------------------------------------------------ set-up
 
@@ -221,7 +231,8 @@ class ITSCallback(BaseCallback):
         if not isinstance(problem, AllocationProblem) or not isinstance(self.model.policy, AllocatorPolicy):
             raise ValueError(
                 "ITSCallback needs an AllocatorPolicy on a TaskAllocation environment, found "
-                f"{type(self.model.policy).__name__} on {self.training_env}."
+                f"{type(self.model.policy).__name__} on {self.training_env}; its VecEnv must be a BatchedVecEnv or a "
+                "DummyVecEnv (not --vec-env subproc) without wrappers."
             )
         self.problem = problem
         own = getattr(self.model, "instances_per_epoch", None)
@@ -240,28 +251,39 @@ class ITSCallback(BaseCallback):
             self._make_router()
             if self.resume_from is not None:
                 self._resume(self.resume_from)
-            elif self._instances_seen() > 0:
+            elif self.model._n_updates > 0:
                 raise ValueError(
                     "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
                     f"{CHECKPOINT_FOLDER} folder of the earlier run."
                 )
             self._started = True
+        # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
+        self._instances_before = self.epoch * self.instances_per_epoch
+        self._steps_before = self.model.num_timesteps
         self._hand_over_router()
-        if not self.records and self.n_pretraining_epochs > 0:
+        if self.epoch == 0 and len(self.records) < self.n_pretraining_epochs:
             self._router_env.set_generator(WholeInstances(self.problem.generator))
-            self._train_router(self.n_pretraining_epochs, "pre-training")
-            self._save_checkpoint()
+            self._train_router(self.n_pretraining_epochs, "pre-training", first=len(self.records))
         self._freezers["router"].freeze()
         if isinstance(self.model, REINFORCE):
-            self.model.max_instances = self.n_epochs * self.instances_per_epoch
+            self._callers_limit = self.model.max_instances
+            limit = self.n_epochs * self.instances_per_epoch
+            self.model.max_instances = limit if self._callers_limit is None else min(limit, self._callers_limit)
         self._begin_epoch()
 
     def _make_router(self) -> None:
         kwargs = dict(self.router_kwargs)
         algo, n_envs = kwargs.pop("algo", "reinforce"), kwargs.pop("n_envs", self.training_env.num_envs)
         algorithm = resolve_algorithm(algo)
-        if kwargs["policy"] == "RouterPolicy":
+        if kwargs["policy"] in ("RouterPolicy", f"{RouterPolicy.__module__}.RouterPolicy", "sb3_uav.policies.RouterPolicy"):
             kwargs["policy"] = RouterPolicy
+        if not isinstance(n_envs, int) or n_envs < 1:
+            raise ValueError(f"router: n_envs is {n_envs!r}; it must be a whole number of at least 1.")
+        if isinstance(kwargs.get("learning_rate"), str):
+            raise ValueError(
+                f"router: learning_rate is {kwargs['learning_rate']!r}; write a number. How many steps the router will "
+                "take is not known, so it has no schedule but lr_decay."
+            )
         generator = WholeInstances(self.problem.generator)
         self._router_env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=generator)] * n_envs)
         if algorithm is REINFORCE:
@@ -269,7 +291,8 @@ class ITSCallback(BaseCallback):
         # The next seed, because with the same one both levels would draw the same points.
         seed = None if self.model.seed is None else self.model.seed + 1
         try:
-            self.router = algorithm(env=self._router_env, seed=seed, device=self.model.device, **kwargs)
+            with undisturbed_random_state():
+                self.router = algorithm(env=self._router_env, seed=seed, device=self.model.device, **kwargs)
         except TypeError as error:
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self._router_policy, RouterPolicy):
@@ -302,7 +325,11 @@ class ITSCallback(BaseCallback):
         monitor = getattr(self.training_env.unwrapped, "monitor_folder", None)
         if monitor is not None:
             return Path(monitor)
-        return None if self.logger.dir is None else Path(self.logger.dir)
+        # Without output files, SB3's logger names a temporary folder, where nobody would look for zips.
+        if any(not isinstance(output, HumanOutputFormat) for output in self.logger.output_formats) and self.logger.dir:
+            return Path(self.logger.dir)
+        warnings.warn("ITSCallback saves no router: set save_path to a folder.", stacklevel=2)
+        return None
 
     # ------------------------------------------------------------------------------------------------------ epochs
 
@@ -310,7 +337,7 @@ class ITSCallback(BaseCallback):
         """Instances that the allocator has learned from."""
         if isinstance(self.model, REINFORCE):
             return self.model.n_instances
-        return self.model.num_timesteps // self.problem.generator.n_tasks
+        return self._instances_before + (self.model.num_timesteps - self._steps_before) // self.problem.generator.n_tasks
 
     def _begin_epoch(self) -> None:
         self._statistics.reset_statistics()
@@ -330,9 +357,16 @@ class ITSCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         # rl_zoo3 calls this a second time, and after Ctrl-C, when training the router for an epoch is not wanted.
-        finished = self.model.num_timesteps >= self.model._total_timesteps
-        if self._started and finished and self._epoch_is_over():
+        if not self._started:
+            return
+        self._save_best_router()
+        if self.model.num_timesteps >= self.model._total_timesteps and self._epoch_is_over():
             self._end_epoch()
+        self._save_router()
+        for freezer in self._freezers.values():
+            freezer.thaw()
+        if isinstance(self.model, REINFORCE):
+            self.model.max_instances = self._callers_limit
 
     def _epoch_is_over(self) -> bool:
         assert self.instances_per_epoch is not None
@@ -352,6 +386,8 @@ class ITSCallback(BaseCallback):
                 self._train_on_subsets(self.n_continuous_epochs, 1.0, phase)
         if self.epoch % self.checkpoint_freq == 0 or self.epoch == self.n_epochs:
             self._save_checkpoint()
+        else:
+            self._save_router()
         self._begin_epoch()
 
     def _train_on_subsets(self, n_epochs: int, fraction: float, phase: str) -> None:
@@ -391,33 +427,53 @@ class ITSCallback(BaseCallback):
     def _seed(self) -> int:
         return getattr(self.model, "stream_seed", None) or self.model.seed or 0
 
-    def _train_router(self, n_epochs: int, phase: str) -> None:
-        assert self.instances_per_epoch is not None
-        for index in range(n_epochs):
-            start = time.time()
-            number = 1 + sum(record.level == "router" for record in self.records)
+    def _n_router_epochs(self) -> int:
+        return sum(record.level == "router" for record in self.records)
+
+    def _train_router(self, n_epochs: int, phase: str, first: int = 0) -> None:
+        """
+        :param n_epochs: Epochs of the block
+        :param phase: Name of the block
+        :param first: Epochs of it that are done already
+        """
+        for index in range(first, n_epochs):
+            start, number = time.time(), 1 + self._n_router_epochs()
             statistics = EpisodeStatistics()
             with_bar, close_bar = self._progress(f"router, {phase} {index + 1}/{n_epochs}")
-            callbacks = [statistics, *with_bar]
             try:
-                self._learn_router(callbacks)
+                n_instances = self._learn_router(number, statistics, with_bar)
             finally:
                 close_bar()
-            self._record("router", number, phase, self.instances_per_epoch, statistics.mean_return, start)
+            self._record("router", number, phase, n_instances, statistics.mean_return, start)
+            if phase == "pre-training":
+                self._save_checkpoint()
+            else:
+                self._save_router()
         self.router.policy.set_training_mode(False)
 
-    def _learn_router(self, callbacks: list[BaseCallback]) -> None:
-        """Let the router learn for one epoch."""
+    def _learn_router(self, number: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
+        """
+        Let the router learn for one epoch.
+
+        :param number: Number of the epoch, from 1
+        :param statistics: Counts its episodes
+        :param others: More callbacks
+        :return: How many instances it learned from
+        """
         assert self.instances_per_epoch is not None
+        callback = CallbackList([statistics, *others])
         if isinstance(self.router, REINFORCE):
-            self.router.learn_instances(self.instances_per_epoch, CallbackList(callbacks))
-            return
-        n_episodes = -(-self.instances_per_epoch // self.router.n_envs)
-        callbacks = [*callbacks, StopTrainingOnMaxEpisodes(n_episodes)]
+            before = self.router.n_instances
+            # Up to a multiple of the epoch's size, so that whole batches do not add up to more epochs than there are.
+            self.router.learn_instances(number * self.instances_per_epoch - before, callback)
+            return self.router.n_instances - before
         # SB3 keeps the last observation of the previous generator's instances otherwise.
         self.router._last_obs = None
-        limit = NO_STEP_LIMIT - self.router.num_timesteps
-        self.router.learn(limit, CallbackList(callbacks), reset_num_timesteps=False)
+        # Whole rollouts, because SB3 throws away one that a callback stops.
+        steps = self.router.n_steps * self.router.n_envs
+        while statistics.n_episodes < self.instances_per_epoch:
+            self.router.learn(steps, callback, reset_num_timesteps=False)
+        return statistics.n_episodes
 
     def _progress(self, description: str) -> tuple[list[BaseCallback], Any]:
         """A callback that reports on the run's progress bar, if there is one, and what to call afterwards."""
@@ -458,9 +514,10 @@ class ITSCallback(BaseCallback):
     def _save_best_router(self) -> None:
         """Keep the router that the best allocator was evaluated with."""
         for callback in self._siblings(EvalCallback):
-            if callback.best_mean_reward > self._best_mean_reward and callback.best_model_save_path is not None:
-                self._best_mean_reward = callback.best_mean_reward
-                save_atomically(self.router, Path(callback.best_model_save_path) / "best_router.zip")
+            folder = callback.best_model_save_path
+            if folder is not None and callback.best_mean_reward > self._best_mean_reward.get(folder, -np.inf):
+                self._best_mean_reward[folder] = callback.best_mean_reward
+                save_atomically(self.router, Path(folder) / "best_router.zip")
 
     def _save_checkpoint(self) -> None:
         """
@@ -472,13 +529,13 @@ class ITSCallback(BaseCallback):
         if self.save_path is None:
             return
         folder = self.save_path / CHECKPOINT_FOLDER
-        names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self.epoch}.zip"}
+        names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self._n_router_epochs()}.zip"}
         save_atomically(self.model, folder / names["allocator"])
         save_atomically(self.router, folder / names["router"])
         state = {"epoch": self.epoch, **names, "records": [asdict(record) for record in self.records]}
         write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
-        for old in folder.glob("*.zip"):
-            if old.name not in names.values():
+        for old in folder.iterdir():
+            if re.fullmatch(r"(allocator|router)_\d+\.zip", old.name) and old.name not in names.values():
                 old.unlink()
 
     def _resume(self, folder: Path) -> None:
@@ -490,7 +547,11 @@ class ITSCallback(BaseCallback):
             )
         self.epoch = state["epoch"]
         self.records = [EpochRecord(**record) for record in state["records"]]
-        loaded = type(self.router).load(folder / state["router"], env=self._router_env, device=self.model.device)
+        try:
+            with undisturbed_random_state():
+                loaded = type(self.router).load(folder / state["router"], env=self._router_env, device=self.model.device)
+        except (ValueError, RuntimeError, OSError) as error:
+            raise ValueError(f"{folder / state['router']}: not an intact router ({error}); use another checkpoint.") from error
         loaded.set_logger(self.router.logger)
         self.router = loaded
         self._start_router_env()
@@ -515,6 +576,8 @@ def read_state(folder: Path) -> dict[str, Any]:
     try:
         state = json.loads(path.read_text())
         missing = {"epoch", "allocator", "router", "records"} - set(state)
+        for record in state.get("records", []):
+            EpochRecord(**record)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: not an intact state file ({error}); resume from another checkpoint.") from error
     if missing:
@@ -538,6 +601,16 @@ def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
     if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
         raise ValueError(f"router: algo {name!r} is not an on-policy algorithm of SB3.")
     return algorithm
+
+
+@contextmanager
+def undisturbed_random_state() -> Iterator[None]:
+    """Undo the seeding of the global generators by an algorithm's constructor, in the middle of another one's training."""
+    states = random.getstate(), np.random.get_state()
+    with th.random.fork_rng():
+        yield
+    random.setstate(states[0])
+    np.random.set_state(states[1])
 
 
 def walk_callbacks(callback: Any) -> Iterator[BaseCallback]:

@@ -12,6 +12,9 @@ from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.instances import InstanceGenerator, Instances
 from sb3_uav.policies import AllocatorPolicy
 
+# How many instances of a test are allocated at once: the smaller of the paper's batches.
+HELD_OUT_ROWS = 256
+
 
 class WholeInstances:
     """
@@ -36,7 +39,8 @@ class AllocatedSubsets:
 
     Instances are taken ``shuffle_batches`` batches at a time and the subsets of these are shuffled, which breaks the
     correlation between the subsets of an instance without holding a whole epoch in memory. After the last batch it starts
-    again with the first one and new samples.
+    again with the first one and new samples. Unlike other generators it goes on where it stopped, whatever ``rng`` is: the
+    subsets follow from the allocator and the numbers of the batches.
 
     :param allocator: The allocator
     :param generator: Draws the instances of the fleet, for :meth:`held_out`
@@ -72,7 +76,7 @@ class AllocatedSubsets:
         self._ready: Instances | None = None
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
-        """``rng`` is not used: the subsets follow from the allocator and the numbers of the batches."""
+        """The next ``batch_size`` subsets; ``rng`` is not used."""
         while self._ready is None or len(self._ready) < batch_size:
             chunk = self._next_chunk()
             self._ready = chunk if self._ready is None else Instances.concatenate([self._ready, chunk])
@@ -84,9 +88,9 @@ class AllocatedSubsets:
         self._n_chunks += 1
         parts = []
         for _ in range(min(self.shuffle_batches, len(self.batches))):
-            parts.append(self.draw_batch(self.batches[self._next_batch]))
+            parts.append(self._allocate(self.draw_batch(self.batches[self._next_batch]), rng))
             self._next_batch = (self._next_batch + 1) % len(self.batches)
-        subsets = self._allocate(Instances.concatenate(parts), rng)
+        subsets = Instances.concatenate(parts)
         kept = rng.permutation(len(subsets))[: max(round(self.fraction * len(subsets)), 1)]
         return subsets[kept]
 
@@ -105,5 +109,6 @@ class AllocatedSubsets:
         :param rng: The source of randomness
         """
         instances = self.generator(-(-batch_size // self.generator.n_uavs), rng)
-        subsets = self._allocate(instances, rng)
+        rows = th.arange(len(instances)).split(HELD_OUT_ROWS)
+        subsets = Instances.concatenate([self._allocate(instances[part], rng) for part in rows])
         return subsets[rng.permutation(len(subsets))[:batch_size]]

@@ -116,8 +116,8 @@ def run_evaluate(args: argparse.Namespace) -> int:
         n_real, n_reachable = int(batch.task_mask.sum()), int(batch.reachable().sum())
         if n_reachable < n_real:
             print(
-                f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks lie farther than max_distance / 2 from their depot; "
-                "no schedule can visit them.",
+                f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks lie farther than max_distance / 2 from their "
+                "depot; no schedule can visit them.",
                 file=sys.stderr,
             )
     solvers = make_solvers(args)

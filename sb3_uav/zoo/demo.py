@@ -44,7 +44,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if code != 0:
         return code
-    return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
+    try:
+        return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
+    except (ValueError, FileNotFoundError, ImportError) as error:
+        print(f"sb3_uav.zoo.demo: {error}", file=sys.stderr)
+        return 2
 
 
 def newest_run(folder: Path, env_id: str) -> Path:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 
@@ -43,20 +44,21 @@ def _enjoy(arguments: list[str]) -> int:
     parser.add_argument("--load-best", action="store_true")
     parser.add_argument("--load-checkpoint", type=int)
     parser.add_argument("--load-last-checkpoint", action="store_true")
+    parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
-    which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
-    _, _, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
-    router = find_router(Path(run_folder), known.load_best)
+    router = None
+    if not known.help:
+        which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
+        _, _, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
+        router = find_router(Path(run_folder), known.load_best)
 
-    # A plain function would become a method of the class that it is set on.
-    ExperimentManager.default_vec_env_cls = staticmethod(make_batched_vec_env)  # type: ignore[assignment]
-    rl_zoo3.enjoy.create_test_env = partial(_create_test_env, create_test_env, router)
-    previous = sys.argv
-    sys.argv = ["sb3_uav.zoo.enjoy", "--algo", known.algo, "-f", known.folder, *arguments]
-    try:
+    with (
+        # A plain function would become a method of the class that it is set on.
+        patch.object(ExperimentManager, "default_vec_env_cls", staticmethod(make_batched_vec_env)),
+        patch.object(rl_zoo3.enjoy, "create_test_env", partial(_create_test_env, create_test_env, router)),
+        patch.object(sys, "argv", ["sb3_uav.zoo.enjoy", "--algo", known.algo, "-f", known.folder, *arguments]),
+    ):
         rl_zoo3.enjoy.enjoy()
-    finally:
-        sys.argv = previous
     return 0
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import re
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 
 try:
@@ -25,8 +27,11 @@ import sb3_uav
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
+from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
 
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
+# Added to the seed of the training environments, whose rows take the seeds that follow it.
+EVALUATION_SEED = 1_000_003
 # What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
 ZOO_KEYS = {
     "n_envs",
@@ -77,8 +82,12 @@ class UAVExperimentManager(ExperimentManager):
 
     - ``env_kwargs`` of a YAML reach the evaluation environment too;
     - ``const_X`` is a constant, and numbers that YAML reads as strings (``1e-3``) are numbers;
-    - a misspelled key is named, with the nearest known one.
+    - a misspelled key is named, with the nearest known one;
+    - the evaluation environment is not seeded like the training environment, whose instances it would get.
     """
+
+    # Whether the command line says how often to evaluate; if not, it is done once per epoch where there are epochs.
+    eval_freq_given = False
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
@@ -93,7 +102,21 @@ class UAVExperimentManager(ExperimentManager):
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
         check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], f"{self.config}, {self.env_name.gym_id}")
-        return hyperparams, saved
+        return {key: plain_numbers(value) for key, value in hyperparams.items()}, saved
+
+    def setup_experiment(self) -> Any:
+        if self.optimize_hyperparameters and self.algo in OUR_ALGORITHMS:
+            raise ValueError(f"-optimize has no search space for {self.algo} yet; tune ppo, or set the values by hand.")
+        try:
+            return super().setup_experiment()
+        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
+            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        env = super().create_envs(n_envs, eval_env, no_log)
+        if eval_env:
+            env.seed(self.seed + EVALUATION_SEED)
+        return env
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         try:
@@ -102,6 +125,9 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self.config}: an argument of 'callback' does not fit: {error}") from error
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
+        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
+        if not self.eval_freq_given and self.eval_freq > 0 and n_tasks and "instances_per_epoch" in hyperparams:
+            self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
         return processed
 
     @staticmethod
@@ -117,13 +143,42 @@ class UAVExperimentManager(ExperimentManager):
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
                 if self.continue_training and callback.resume_from is None:
-                    callback.resume_from = Path(self.trained_agent).parent
+                    callback.resume_from = find_checkpoint(Path(self.trained_agent))
 
     @property
     def its(self) -> ITSCallback | None:
         """The interactive training strategy of this run, if it has one."""
         found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
         return found[0] if found else None
+
+
+def find_checkpoint(trained_agent: Path) -> Path:
+    """
+    :param trained_agent: The allocator's zip to go on from
+    :return: The folder with the state of its interactive training
+    :raises FileNotFoundError: If there is none; the message names the zip to use if there is one near
+    """
+    beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
+    if (beside / STATE_FILE).is_file():
+        return beside
+    if (below / STATE_FILE).is_file():
+        return below
+    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which knows its router.")
+
+
+def plain_numbers(value: Any) -> Any:
+    """
+    :param value: From a YAML file
+    :return: The same with numbers for texts such as ``1e-3``, which YAML 1.1 does not take for numbers
+    """
+    if isinstance(value, dict):
+        return {key: plain_numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [plain_numbers(item) for item in value]
+    if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d*)?[eE][+-]?\d+", value):
+        number = float(value)
+        return int(number) if number.is_integer() else number
+    return value
 
 
 def check_keys(found: set[str], algorithm: type, where: str) -> None:

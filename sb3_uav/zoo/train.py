@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from unittest.mock import patch
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Train with rl_zoo3; every flag of ``rl_zoo3.train`` works.
+    Train with rl_zoo3; every flag of ``rl_zoo3.train`` works, but for ``-optimize`` with our own algorithms.
 
     :param argv: Command line arguments; those of the process when None
     :return: Exit code
@@ -31,21 +33,24 @@ def _train(arguments: list[str]) -> int:
     from sb3_uav.zoo.experiment import UAVExperimentManager, default_config, register_algorithms, rl_zoo3
 
     register_algorithms()
-    rl_zoo3.train.ExperimentManager = UAVExperimentManager  # type: ignore[misc]
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="reinforce")
     parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("--eval-freq")
+    parser.add_argument("-i", "--trained-agent")
     known, _ = parser.parse_known_args(arguments)
+    if known.trained_agent is not None and not Path(known.trained_agent).is_file():
+        raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
+    UAVExperimentManager.eval_freq_given = known.eval_freq is not None
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo)) is not None:
         defaults = ["--conf-file", str(config)]
-    previous = sys.argv
-    # rl_zoo3.train.train reads sys.argv and takes no arguments.
-    sys.argv = ["sb3_uav.zoo.train", "--algo", known.algo, *defaults, *arguments]
-    try:
+    # rl_zoo3.train.train makes its manager by this name, reads sys.argv and takes no arguments.
+    with (
+        patch.object(rl_zoo3.train, "ExperimentManager", UAVExperimentManager),
+        patch.object(sys, "argv", ["sb3_uav.zoo.train", "--algo", known.algo, *defaults, *arguments]),
+    ):
         rl_zoo3.train.train()
-    finally:
-        sys.argv = previous
     return 0
 
 
