@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--n-tasks", type=int, default=80)
     parser.add_argument("--n-uavs", type=int, default=4)
     parser.add_argument("--n-envs", type=int, default=64, help="rows of the collection")
-    parser.add_argument("--n-episodes", type=int, default=8, help="episodes of the training pass")
+    parser.add_argument("--n-episodes", type=int, default=64, help="episodes of the training pass")
     args = parser.parse_args()
 
     th.manual_seed(0)
