@@ -1,5 +1,6 @@
 """The networks: what the paper prescribes, and that every way to use them computes the same."""
 
+import inspect
 import math
 from functools import partial
 from typing import Any
@@ -446,17 +447,90 @@ def test_changed_parameters_clear_the_cache(change):
         assert not th.equal(policy.predict_values(tensor), before)
 
 
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("key", ["depot", "tasks", "task_values"])
+def test_observations_overwritten_in_place_are_noticed(level, key):
+    """Tensors share the memory of an environment's arrays, so the cache must not compare an array with itself."""
+    policy = make_policy(level)
+    observation = make_vec(level).reset()
+    tensor = obs_as_tensor(observation, th.device("cpu"))
+    with th.no_grad():
+        before = policy(tensor, deterministic=True)
+        for row in (2, slice(None)):
+            observation[key][row] = 0.5 * observation[key][row] + 0.1
+            assert th.equal(tensor[key], th.from_numpy(observation[key]))
+            _, values, log_prob = policy(tensor, deterministic=True)
+            _, fresh_values, fresh_log_prob = make_policy(level)(tensor, deterministic=True)
+            th.testing.assert_close(values, fresh_values, atol=1e-6, rtol=0)
+            th.testing.assert_close(log_prob, fresh_log_prob, atol=1e-6, rtol=0)
+            assert ((values - before[1]).abs()[row] > 1e-4).all()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_decoding_in_training_mode_is_decoding_in_evaluation_mode(level):
+    """No batch statistics are learned or used, so what else is in the batch does not matter."""
+    policy = make_policy(level, preset="paper")
+    shake_statistics(policy)
+    n_uavs = 3 if level == "allocator" else 1
+    instances, others = draw(6, n_uavs=n_uavs), draw(10, n_uavs=n_uavs, seed=1)
+    others.tasks.mul_(5.0).add_(3.0)
+    expected = policy.decode_episodes(instances)
+    buffers = {name: value.clone() for name, value in policy.named_buffers()}
+    assert len(buffers) > 0
+    batches = (
+        instances,
+        Instances.concatenate([instances, others]),
+        Instances.concatenate([instances[0], others]),
+        instances[0],
+    )
+    for batch in batches:
+        policy.set_training_mode(True)
+        found = policy.decode_episodes(batch)
+        for name, value in policy.named_buffers():
+            assert th.equal(value, buffers[name]), name
+        n_rows = 1 if len(batch) in (1, 11) else 6
+        n_steps = min(expected.shape[-1], found.shape[-1])
+        assert th.equal(found[:n_rows, :, :n_steps], expected[:n_rows, :, :n_steps])
+        # Tours are padded to the longest of the batch.
+        assert (found[:n_rows, :, n_steps:] == 0).all() and (expected[:n_rows, :, n_steps:] == 0).all()
+
+
 # ------------------------------------------------------------------------------------------ SB3's contracts
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_policy_save_and_load_keep_every_argument(level, tmp_path):
-    policy = make_policy(level, preset="paper", net_arch=dict(pi=[], vf=[8]), activation_fn=nn.ReLU, ortho_init=True)
+    """None of them at its default, and none forgotten here: the keys are those of the constructor."""
+    given: dict[str, Any] = dict(
+        preset="paper",
+        embed_dim=12,
+        n_layers=1,
+        n_heads=3,
+        ff_dim=20,
+        normalization="layer",
+        use_values=True,
+        net_arch=dict(pi=[], vf=[8]),
+        activation_fn=nn.ReLU,
+        ortho_init=True,
+        optimizer_class=th.optim.AdamW,
+        optimizer_kwargs=dict(eps=1e-6, weight_decay=0.1),
+    )
+    policy = make_policy(level, **given)
+    signature = inspect.signature(type(policy)).parameters
+    assert all(given[key] != signature[key].default for key in given)
     policy.save(tmp_path / "policy.pth")
     loaded = type(policy).load(tmp_path / "policy.pth", device="cpu")
-    assert loaded._get_constructor_parameters().keys() == policy._get_constructor_parameters().keys()
-    for key in ("preset", "embed_dim", "n_layers", "normalization", "net_arch", "activation_fn", "ortho_init"):
-        assert loaded._get_constructor_parameters()[key] == policy._get_constructor_parameters()[key], key
+    not_compared = {"observation_space", "action_space", "lr_schedule"}
+    for each in (policy, loaded):
+        parameters = each._get_constructor_parameters()
+        # use_sde is refused unless False.
+        assert set(parameters) == not_compared | set(given) == set(signature) - {"use_sde"}
+        for key, value in given.items():
+            assert parameters[key] == value, key
+        assert type(each.optimizer) is th.optim.AdamW
+        assert each.optimizer.defaults["eps"] == 1e-6 and each.optimizer.defaults["weight_decay"] == 0.1
+        encoder = each.features_extractor.encoder
+        assert (len(encoder.layers), encoder.layers[0].attention.n_heads, encoder.use_values) == (1, 3, True)
     for name, value in policy.state_dict().items():
         assert th.equal(value, loaded.state_dict()[name])
 
@@ -527,6 +601,20 @@ def test_foreign_observation_space_is_refused():
     env = make_vec_env("CartPole-v1")
     with pytest.raises(ValueError, match="needs the Dict observation of a sb3_uav environment"):
         AllocatorPolicy(env.observation_space, env.action_space, lambda _: 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("level", "environment", "missing"),
+    [("allocator", "TaskAllocation", "assignment"), ("router", "RoutePlanning", "position")],
+)
+def test_observation_space_of_the_other_level_is_refused(level, environment, missing):
+    env: Any = RoutePlanningEnv(7) if level == "allocator" else TaskAllocationEnv(7, 3)
+    policy_class: Any = AllocatorPolicy if level == "allocator" else RouterPolicy
+    message = f"needs the observation of a {environment} environment.*'{missing}'"
+    with pytest.raises(ValueError, match=message):
+        policy_class.extractor_class(env.observation_space)
+    with pytest.raises(ValueError, match=message):
+        policy_class(env.observation_space, env.action_space, lambda _: 1e-3)
 
 
 def test_batch_norm_learns_from_real_nodes_only():

@@ -110,6 +110,7 @@ def test_enjoy_replays_with_the_trained_router(trained, capsys):
         assert enjoy.main([*arguments, *flags]) == 0
         printed = capsys.readouterr().out
         assert printed.count("Episode Reward:") == 3 and "3 Episodes" in printed
+        assert ("hold no router" in printed) == ("--load-checkpoint" in flags)
         name = "best_router.zip" if flags == ["--load-best"] else "router.zip"
         assert f"Rewards come from the router {run_folder(trained) / name}" in printed
 

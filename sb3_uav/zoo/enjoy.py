@@ -51,6 +51,8 @@ def _enjoy(arguments: list[str]) -> int:
         which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
         _, _, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
         router = find_router(Path(run_folder), known.load_best)
+        if router is not None and (known.load_checkpoint is not None or known.load_last_checkpoint):
+            print("Checkpoints of the zoo hold no router: rewards come from the run's last one.")
 
     with (
         # A plain function would become a method of the class that it is set on.
