@@ -54,6 +54,7 @@ class AllocatorExtractor(EpisodicExtractor):
         normalization: str = "instance",
         use_values: bool = True,
     ) -> None:
+        n_uavs = self.n_actions(observation_space)
         super().__init__(
             observation_space,
             2 * embed_dim,
@@ -64,8 +65,7 @@ class AllocatorExtractor(EpisodicExtractor):
             normalization=normalization,
             use_values=use_values,
         )
-        assert isinstance(observation_space, spaces.Dict)
-        self.n_uavs = int(observation_space["action_mask"].shape[0])  # type: ignore[index]
+        self.n_uavs = n_uavs
         self.project_context = nn.Linear(self.n_uavs * embed_dim, embed_dim)
         self.feed_forward = nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
 

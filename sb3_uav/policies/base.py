@@ -91,20 +91,27 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     own_key: ClassVar[str]
 
     def __init__(self, observation_space: spaces.Space, features_dim: int, **encoder_kwargs: Any) -> None:
-        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
-            raise ValueError(
-                f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}."
-            )
-        if self.own_key not in observation_space.spaces:
-            raise ValueError(
-                f"{type(self).__name__} needs the observation of a {self.environment} environment, but its keys "
-                f"{sorted(observation_space.spaces)} lack {self.own_key!r}; use the policy of the other level."
-            )
         super().__init__(observation_space, features_dim)
         self.encoder = AttentionEncoder(**encoder_kwargs)
         self.use_cache = True
         self.n_encoded_rows = 0
         self._cached: tuple[StaticObservation, Cache] | None = None
+
+    @classmethod
+    def n_actions(cls, observation_space: spaces.Space) -> int:
+        """
+        :param observation_space: What the extractor is to be made for
+        :return: Number of actions
+        :raises ValueError: If it is not that of this level's environment
+        """
+        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
+            raise ValueError(f"{cls.__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}.")
+        if cls.own_key not in observation_space.spaces:
+            raise ValueError(
+                f"{cls.__name__} needs the observation of a {cls.environment} environment, but its keys "
+                f"{sorted(observation_space.spaces)} lack {cls.own_key!r}; use the policy of the other level."
+            )
+        return int(observation_space["action_mask"].shape[0])  # type: ignore[index]
 
     @abstractmethod
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:

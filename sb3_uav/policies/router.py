@@ -61,11 +61,9 @@ class RouterExtractor(EpisodicExtractor):
         normalization: str = "instance",
         use_values: bool = True,
     ) -> None:
-        assert isinstance(observation_space, spaces.Dict)
-        n_actions = int(observation_space["action_mask"].shape[0])  # type: ignore[index]
         super().__init__(
             observation_space,
-            n_actions + embed_dim,
+            self.n_actions(observation_space) + embed_dim,
             embed_dim=embed_dim,
             n_layers=n_layers,
             n_heads=n_heads,

@@ -38,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
             *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
             *("--eval-freq", "1000000", "--eval-episodes", "50"),
+            # Networks this small gain little from a second thread, and lose much when another process needs the core.
+            *("--num-threads", "1"),
             *(["--progress"] if sys.stdout.isatty() else []),
             *train_args,
         ]
