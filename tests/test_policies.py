@@ -52,7 +52,7 @@ def count(module: nn.Module) -> int:
 
 
 def test_paper_preset_parameter_counts():
-    """Counts worked out by hand from DESIGN section 5."""
+    """Counts worked out by hand from the sizes in section IV-A2 of the paper."""
     d, ff = 128, 512
     layer = 4 * d * d + (d * ff + ff) + (ff * d + d) + 2 * 2 * d
     encoder = 2 * (2 * d + d) + 3 * layer

@@ -334,7 +334,7 @@ def shipped() -> dict[str, Any]:
 @pytest.mark.parametrize("n_uavs", PAPER_FLEETS)
 @pytest.mark.parametrize("n_tasks", PAPER_SIZES)
 def test_shipped_settings_are_the_papers(n_uavs, n_tasks):
-    """Section V-A of the paper and DESIGN section 5."""
+    """Section V-A of the paper."""
     settings = shipped()[allocation_id(n_uavs, n_tasks)]
     batch = 512 if n_tasks < 300 else 256
     assert settings["n_envs"] == batch and settings["policy_kwargs"] == {"preset": "paper"}

@@ -38,7 +38,7 @@ class RoutingState(NamedTuple):
 
 class RoutingDynamics(Dynamics):
     """
-    Transitions of route planning (paper, section IV-B; DESIGN, section 5).
+    Transitions of route planning (paper, section IV-B).
 
     A task is legal while it is unvisited and the UAV could fly to it and from there home: travelled + d(here, task) +
     d(task, depot) <= D. The depot is legal only when no task is, because an early return can never help. An illegal action

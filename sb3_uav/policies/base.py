@@ -1,9 +1,9 @@
 """
 Policies that encode an instance once and decode it many times.
 
-``encode(instances) -> cache`` and ``decode_step(cache, state) -> logits, values`` are the only places that compute logits
-(DESIGN, decision 4). SB3's step loop reaches them through :meth:`EpisodicPolicy._decode_observation`; the fused driver
-through :meth:`EpisodicPolicy.decode_episodes` and :meth:`EpisodicPolicy.evaluate_episodes`.
+``encode(instances) -> cache`` and ``decode_step(cache, state) -> logits, values`` are the only places that compute logits.
+SB3's step loop reaches them through :meth:`EpisodicPolicy._decode_observation`; the fused driver through
+:meth:`EpisodicPolicy.decode_episodes` and :meth:`EpisodicPolicy.evaluate_episodes`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sb3_uav.policies.memory import rows_that_fit
 # The settings of the encoder, by preset; arguments of the policy override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
     "default": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="instance", use_values=True),
-    # Section IV-A2 of the paper and DESIGN section 5.
+    # Section IV-A2 of the paper.
     "paper": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch", use_values=False),
 }
 

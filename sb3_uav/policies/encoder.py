@@ -89,8 +89,8 @@ class NodeNorm(nn.Module):
     Normalization of node embeddings that leaves padded nodes out.
 
     Batch normalization is the paper's. Its statistics differ between acting and training, which breaks PPO's ratios, so it is
-    the default of the ``paper`` preset only. Normalization per instance learned somewhat faster than per node (``"layer"``) at a
-    learning rate of 1e-3, and went on learning at 3e-3, where that stalled.
+    the default of the ``paper`` preset only. Normalization per instance learned somewhat faster than per node (``"layer"``)
+    at a learning rate of 1e-3, and went on learning at 3e-3, where that stalled.
 
     :param kind: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param embed_dim: Size of the embeddings
