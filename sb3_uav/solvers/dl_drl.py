@@ -11,16 +11,19 @@ import torch as th
 from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
+from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
 from sb3_uav.solvers.base import Solver, SolverResult
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
-DECODINGS = ("greedy", "sampling")
+DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
+# Into how many views of an instance augmentation splits its samples: the symmetries, and for each the sweep in both directions.
+N_VIEWS = 2 * N_SYMMETRIES
 
 
 def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
@@ -45,7 +48,8 @@ class DLDRL(Solver):
 
     :param allocator: The upper level's policy
     :param router: The lower level's policy
-    :param decode: ``"greedy"``, or ``"sampling"`` to keep the best of several sampled allocations
+    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to draw them
+        from several views of the instance: its symmetries, and other task orders where the allocator has some
     :param samples: Number of sampled allocations per instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: How tables and files call it; says how it decodes when None
@@ -76,7 +80,7 @@ class DLDRL(Solver):
 
     @property
     def _decoding(self) -> str:
-        return f"sampling {self.samples}" if self.decode == "sampling" else "greedy"
+        return "greedy" if self.decode == "greedy" else f"{self.decode} {self.samples}"
 
     def untrained(self, seed: int = 0) -> DLDRL:
         """
@@ -93,7 +97,7 @@ class DLDRL(Solver):
     def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
         self.check(instances)
         self.allocator.set_training_mode(False)
-        n_samples = SAMPLE_BLOCK if self.decode == "sampling" else 1
+        n_samples = 1 if self.decode == "greedy" else max(size for _, _, size in self._blocks())
         fitting = self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
         batch_size = min(self.batch_size or fitting, fitting)
         results = []
@@ -104,6 +108,16 @@ class DLDRL(Solver):
             results += [SolverResult(schedule, seconds, len(rows)) for schedule in found]
         return results
 
+    def _blocks(self) -> list[tuple[int, int, int]]:
+        """View, index of the first sample and number of samples of what is decoded at once."""
+        if self.decode == "greedy":
+            return [(0, 0, 1)]
+        if self.decode == "sampling":
+            return [(0, first, min(SAMPLE_BLOCK, self.samples - first)) for first in range(0, self.samples, SAMPLE_BLOCK)]
+        n_views = min(N_VIEWS, self.samples)
+        bounds = [self.samples * view // n_views for view in range(n_views + 1)]
+        return [(view, bounds[view], bounds[view + 1] - bounds[view]) for view in range(n_views)]
+
     def _solve_batch(self, instances: Instances, rows: list[int], seed: int) -> list[Schedule]:
         """
         :param instances: ``batch`` instances
@@ -113,19 +127,25 @@ class DLDRL(Solver):
         """
         n_tasks = max(int(instances.task_mask.sum(1).max()), 1)
         instances = instances.trim(n_tasks).to(self.allocator.device)
-        with th.no_grad():
-            cache = self.allocator.encode(instances)
-        if self.decode == "greedy":
-            planned = plan_tours(instances, self.allocator.decode_episodes(instances, cache=cache), self.router.plan)
-            return schedules(planned.tours[:, 0])
         best_value = th.full((len(instances),), -th.inf, dtype=th.float64, device=instances.device)
         best = [Schedule([])] * len(instances)
-        for first in range(0, self.samples, SAMPLE_BLOCK):
-            n_samples = min(SAMPLE_BLOCK, self.samples - first)
-            assignment = self._sample_block(instances, cache, rows, seed, first)[:, :n_samples]
-            planned = plan_tours(instances, assignment, self.router.plan)
+        seen, cache = -1, None
+        for view, first, n_samples in self._blocks():
+            if view != seen:
+                seen, shown = view, reflect(instances, view // 2)
+                order = self.allocator.task_order(shown, view % 2)
+                shown = shown.reorder(order)
+                with th.no_grad():
+                    cache = self.allocator.encode(shown)
+            assert cache is not None
+            if self.decode == "greedy":
+                assignment = self.allocator.decode_episodes(shown, cache=cache)
+            else:
+                assignment = self._sample_block(shown, cache, rows, seed, first)[:, :n_samples]
+            planned = plan_tours(shown, assignment, self.router.plan)
             value, sample = planned.value.max(1)
             tours = planned.tours[th.arange(len(instances), device=sample.device), sample]
+            tours = order.gather(1, tours.clamp(min=0).flatten(1)).view_as(tours).masked_fill(tours < 0, -1)
             for row, (schedule, better) in enumerate(zip(schedules(tours), (value > best_value).tolist(), strict=True)):
                 if better:
                     best[row] = schedule
@@ -143,12 +163,17 @@ class DLDRL(Solver):
         :param rows: Their indices in what is being solved
         :param seed: Of the samples
         :param first: Index of the first sample of the block
-        :return: ``(batch, SAMPLE_BLOCK, n_tasks)`` int64
+        :return: ``(batch, block, n_tasks)`` int64; of augmentation, the first one is greedy
         """
+        augments = self.decode == "augment"
+        n_samples = max(size for _, _, size in self._blocks()) if augments else SAMPLE_BLOCK
         blocks = []
         for i, row in enumerate(rows):
             state = np.random.SeedSequence([seed, row, first]).generate_state(1, np.uint64)
             generator = th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
             own = Cache(cache.nodes[i : i + 1], tuple(projection[i : i + 1] for projection in cache.projections))
-            blocks.append(self.allocator.decode_episodes(instances[i], SAMPLE_BLOCK, False, generator, own))
+            block = self.allocator.decode_episodes(instances[i], n_samples, False, generator, own)
+            if augments:
+                block[:, :1] = self.allocator.decode_episodes(instances[i], cache=own)
+            blocks.append(block)
         return th.cat(blocks)

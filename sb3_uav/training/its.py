@@ -34,6 +34,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_uav.envs.allocation import AllocationProblem
+from sb3_uav.envs.instances import training_batch
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
@@ -422,7 +423,8 @@ class ITSCallback(BaseCallback):
 
     def _draw_new_batch(self, index: int) -> Any:
         rng = random_stream(self._seed(), TRAINING_STREAM, self.epoch, index)
-        return self.problem.generator(self.training_env.num_envs, rng)
+        assert isinstance(self.model.policy, AllocatorPolicy)
+        return self.model.policy.arrange(training_batch(self.problem.generator, self.training_env.num_envs, rng))
 
     def _seed(self) -> int:
         return getattr(self.model, "stream_seed", None) or self.model.seed or 0
