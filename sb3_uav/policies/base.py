@@ -257,7 +257,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param relative: Whether networks see coordinates relative to the depot in units of the maximum flight distance
     :param geometry: Whether decoders are told distances, slack and loads (the allocator needs ``shared_scorer`` for that)
     :param shared_scorer: Whether one scorer judges all UAVs of the allocator, so that it serves fleets of any size
-    :param sweep: Whether the allocator wants the tasks in the order of :meth:`~sb3_uav.envs.instances.Instances.sweep`
+    :param sweep: Whether the allocator wants the tasks in the order of :func:`~sb3_uav.envs.sweep.sweep_order`
     :param mixed_precision: Whether encoders compute in bfloat16 where that is safe
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
     :param activation_fn: Activation function of ``net_arch``

@@ -19,7 +19,7 @@ from sb3_uav.policies.geometry import N_MOVE_FEATURES, MoveGeometry
 # Logits are clipped to +-10 (paper, equation of u; Bello et al.).
 LOGIT_CLIP = 10.0
 # Hidden size of the geometric bias, and how steeply it prefers near tasks before training.
-BIAS_DIM, NEAREST_FIRST = 32, 4.0
+BIAS_DIM, NEAREST_FIRST = 16, 4.0
 # Into how many chunks by size subsets are cut before they are padded.
 SIZE_CLASSES = 2
 

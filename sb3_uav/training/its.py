@@ -160,6 +160,7 @@ class ITSCallback(BaseCallback):
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
+    :param router_instances_per_epoch: Instances of a router epoch, where they shall be others than those of the allocator
     :param strategy: ``"ITS"``, or one of the paper's ablations: ``"ITS/pre-training"`` (without pre-training),
         ``"ITS/intensive"`` (without intensive training), ``"ITS/pre-training&intensive"`` (neither), ``"independent"``
         (DL-DRL-I: the router is only pre-trained)
@@ -178,6 +179,7 @@ class ITSCallback(BaseCallback):
         n_intensive_epochs: int = 8,
         n_continuous_epochs: int = 4,
         instances_per_epoch: int | None = None,
+        router_instances_per_epoch: int | None = None,
         strategy: str = "ITS",
         save_path: str | None = None,
         resume_from: str | None = None,
@@ -194,6 +196,7 @@ class ITSCallback(BaseCallback):
             ("n_continuous_epochs", n_continuous_epochs, 1),
             ("checkpoint_freq", checkpoint_freq, 1),
             ("instances_per_epoch", 1 if instances_per_epoch is None else instances_per_epoch, 1),
+            ("router_instances_per_epoch", 1 if router_instances_per_epoch is None else router_instances_per_epoch, 1),
         ):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
@@ -205,6 +208,7 @@ class ITSCallback(BaseCallback):
         self.n_intensive_epochs = 0 if strategy.endswith("intensive") else n_intensive_epochs
         self.n_continuous_epochs = n_continuous_epochs
         self.instances_per_epoch = instances_per_epoch
+        self.router_instances_per_epoch = router_instances_per_epoch
         self.strategy = strategy
         self.save_path = None if save_path is None else Path(save_path)
         self.resume_from = None if resume_from is None else Path(resume_from)
@@ -288,7 +292,7 @@ class ITSCallback(BaseCallback):
         generator = WholeInstances(self.problem.generator)
         self._router_env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=generator)] * n_envs)
         if algorithm is REINFORCE:
-            kwargs.setdefault("instances_per_epoch", self.instances_per_epoch)
+            kwargs.setdefault("instances_per_epoch", self._router_epoch_size())
         # The next seed, because with the same one both levels would draw the same points.
         seed = None if self.model.seed is None else self.model.seed + 1
         try:
@@ -310,10 +314,13 @@ class ITSCallback(BaseCallback):
         return self.router.policy
 
     def _hand_over_router(self) -> None:
-        assert isinstance(self._router_policy, RouterPolicy)
+        policy = self.model.policy
+        assert isinstance(self._router_policy, RouterPolicy) and isinstance(policy, AllocatorPolicy)
         environments = [self.training_env, *(callback.eval_env for callback in self._siblings(EvalCallback))]
         for env in environments:
             env.env_method("set_router", self._router_policy.plan)
+            # SB3's step loop meets the tasks in the order of the environment.
+            env.env_method("set_task_order", "sweep" if policy.sweep else "input")
 
     def _siblings(self, kind: type[BaseCallback]) -> list[Any]:
         """The callbacks of this kind in the same training."""
@@ -462,33 +469,38 @@ class ITSCallback(BaseCallback):
         :param others: More callbacks
         :return: How many instances it learned from
         """
-        assert self.instances_per_epoch is not None
+        n_instances = self._router_epoch_size()
         callback = CallbackList([statistics, *others])
         if isinstance(self.router, REINFORCE):
             before = self.router.n_instances
             # Up to a multiple of the epoch's size, so that whole batches do not add up to more epochs than there are.
-            self.router.learn_instances(number * self.instances_per_epoch - before, callback)
+            self.router.learn_instances(number * n_instances - before, callback)
             return self.router.n_instances - before
         # SB3 keeps the last observation of the previous generator's instances otherwise.
         self.router._last_obs = None
         # Whole rollouts, because SB3 throws away one that a callback stops.
         steps = self.router.n_steps * self.router.n_envs
-        while statistics.n_episodes < self.instances_per_epoch:
+        while statistics.n_episodes < n_instances:
             self.router.learn(steps, callback, reset_num_timesteps=False)
         return statistics.n_episodes
+
+    def _router_epoch_size(self) -> int:
+        size = self.router_instances_per_epoch or self.instances_per_epoch
+        assert size is not None
+        return size
 
     def _progress(self, description: str) -> tuple[list[BaseCallback], Any]:
         """A callback that reports on the run's progress bar, if there is one, and what to call afterwards."""
         bars = self._siblings(ProgressBarCallback)
         if not bars:
             return [], lambda: None
-        assert self.instances_per_epoch is not None
+        n_instances = self._router_epoch_size()
         if getattr(bars[0], "pbar", None) is None:
             # Pre-training: the allocator's bar does not exist yet.
-            bar = tqdm(total=self.instances_per_epoch, desc=description)
-            return [OwnProgress(description, bar, self.instances_per_epoch)], bar.close
+            bar = tqdm(total=n_instances, desc=description)
+            return [OwnProgress(description, bar, n_instances)], bar.close
         bar = bars[0].pbar
-        return [RouterProgress(description, bar, self.instances_per_epoch)], lambda: bar.set_description("allocator")
+        return [RouterProgress(description, bar, n_instances)], lambda: bar.set_description("allocator")
 
     # ------------------------------------------------------------------------------------------------------ files
 
