@@ -51,7 +51,9 @@ def test_scaled_instances_look_alike() -> None:
 
 def test_features_of_a_move() -> None:
     """D = 4; the UAV has flown 1.5 to (0, 1.5) and may go to (2, 1.5), home 2.5 from there, but no longer to (0, -1)."""
-    instances = Instances.from_arrays(np.zeros(2), np.array([[0.0, 1.5], [2.0, 1.5], [0.0, -1.0], [0.5, 1.5]]), max_distance=4.0)
+    instances = Instances.from_arrays(
+        np.zeros(2), np.array([[0.0, 1.5], [2.0, 1.5], [0.0, -1.0], [0.5, 1.5]]), max_distance=4.0
+    )
     mask = th.tensor([[[False, False, True, False, True]]])
     geometry = MoveGeometry.of(static_of(instances))
     features = geometry.features(th.tensor([[1]]), th.tensor([[2.5 / 4]]), mask)[0, 0]
@@ -68,8 +70,8 @@ def test_features_of_a_fleet() -> None:
     geometry = FleetGeometry.of(static_of(instances))
     fleet = geometry.initial(1, 2)
     first = th.tensor([[[True, False]]])
-    for task in (0, 1):
-        fleet = geometry.add(fleet, task, first)
+    for own in (0, 1):
+        fleet = geometry.add(fleet, own, first)
     task = th.tensor([[2]])
     features = geometry.features(fleet, task, geometry.owners(task, th.tensor([[[0, 0, -1, -1]]])))[0, 0]
     found = dict(zip(("load", "overload", "empty", "votes"), features[0, :4].tolist(), strict=True))

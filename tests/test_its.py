@@ -241,7 +241,7 @@ def test_pretraining_instances_are_whole():
 
 def make_mixture() -> tuple[AllocatedSubsets, Any]:
     env = BatchedVecEnv([lambda: TaskAllocationEnv(60, 3, distribution="mixture")] * 8)
-    model = REINFORCE(AllocatorPolicy, env, seed=0, device="cpu", policy_kwargs=SMALL, instances_per_epoch=8)
+    model: Any = REINFORCE(AllocatorPolicy, env, seed=0, device="cpu", policy_kwargs=SMALL, instances_per_epoch=8)
     generator = MixtureGenerator(60, 3, min_tasks=24)
     env.set_generator(generator)
     stream = np.random.default_rng

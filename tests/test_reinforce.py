@@ -132,7 +132,9 @@ def test_loss_is_the_papers(baseline):
 
     model.max_grad_norm = 1e9
     model.learn_instances(4, Spy())
-    th.testing.assert_close(model.policy.features_extractor.scorer.score.weight.grad, gradients["expected"], atol=1e-5, rtol=1e-4)
+    th.testing.assert_close(
+        model.policy.features_extractor.scorer.score.weight.grad, gradients["expected"], atol=1e-5, rtol=1e-4
+    )
 
 
 def test_shared_baseline_is_the_mean_of_the_samples():

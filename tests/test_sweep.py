@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -34,7 +35,7 @@ def test_sweep_is_a_permutation_that_turns_once(instances: Instances, gap: int, 
         assert th.equal(swept.values[row], instances.values[row][order[row]])
         sign = -1.0 if clockwise else 1.0
         turned = [sign * angle for angle in angles(swept, row)]
-        assert sum(b < a for a, b in zip(turned, turned[1:], strict=False)) <= 1
+        assert sum(b < a for a, b in itertools.pairwise(turned)) <= 1
 
 
 def test_sweep_starts_after_the_widest_gap() -> None:

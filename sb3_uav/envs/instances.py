@@ -450,7 +450,7 @@ class ClusteredGenerator:
 
 # With fewer tasks than these nearly any allocation visits all of them, and there is little to learn.
 TASKS_PER_UAV = 12
-# Small instances teach nearly as much as large ones and cost less, so there are more of them: 1 would be uniform in the logarithm.
+# Small instances teach nearly as much as large ones and cost less, so there are more of them; 1 is uniform in the logarithm.
 SMALL_SIZES = 1.5
 # Not 1, as equally many tasks in all would need: large batches of small tensors waste less time on launching operations.
 FEWER_INSTANCES = 0.85

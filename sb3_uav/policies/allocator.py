@@ -18,8 +18,8 @@ from sb3_uav.policies.geometry import N_FLEET_FEATURES, FleetGeometry
 
 # Hidden size of the scorer.
 SCORER_DIM = 64
-# What the scorer prefers before training (indices are those of FleetGeometry.features): the UAV that has the task's neighbours,
-# until it has about its share.
+# What the scorer prefers before training (indices of FleetGeometry.features): the UAV that has the task's neighbours, until it
+# has about its share.
 OVERLOAD, VOTES, RELATIVE_DISTANCE = (1, -60.0), (3, 4.0), (4, -0.5)
 
 

@@ -147,9 +147,7 @@ class SelfAttention(nn.Module):
         self.project_in = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_out = nn.Linear(embed_dim, embed_dim, bias=False)
 
-    def forward(
-        self, nodes: th.Tensor, attention_bias: th.Tensor | None, coordinates: th.Tensor | None = None
-    ) -> th.Tensor:
+    def forward(self, nodes: th.Tensor, attention_bias: th.Tensor | None, coordinates: th.Tensor | None = None) -> th.Tensor:
         """
         :param nodes: ``(batch, n_nodes, embed_dim)``
         :param attention_bias: ``(batch, 1, 1, n_nodes)``, 0 for real and -inf for padded nodes, or None

@@ -91,8 +91,8 @@ class MoveGeometry(NamedTuple):
         :param position: ``(batch, n_samples)`` int64, the node where the UAV is
         :param remaining: ``(batch, n_samples)``, what it can still fly, in units of the maximum
         :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
-        :return: ``(batch, n_samples, n_tasks + 1, N_MOVE_FEATURES)``: distance, its logarithm over that of the nearest feasible
-            node, distance home from there, slack left after it, detour, remaining distance, distance home from here
+        :return: ``(batch, n_samples, n_tasks + 1, N_MOVE_FEATURES)``: distance, logarithm of its ratio to that of the nearest
+            feasible node, distance home from there, slack left after it, detour, remaining distance, distance home from here
         """
         here = self.coordinates.gather(1, position[..., None].expand(-1, -1, 2))
         distance = euclidean(self.coordinates[:, None], here[:, :, None])
@@ -110,13 +110,13 @@ class FleetState(NamedTuple):
     """
     Where the UAVs' tasks lie. A UAV without tasks has only zeros.
 
-    :param count: ``(batch, n_samples, n_uavs)``, number of tasks
+    :param n_tasks: ``(batch, n_samples, n_uavs)``, how many
     :param total: ``(batch, n_samples, n_uavs, 2)``, sum of their coordinates
     :param last: ``(batch, n_samples, n_uavs, 2)``, coordinates of the last one
     :param box: ``(batch, n_samples, n_uavs, 4)``, the largest x, y, -x, -y of them and the depot
     """
 
-    count: th.Tensor
+    n_tasks: th.Tensor
     total: th.Tensor
     last: th.Tensor
     box: th.Tensor
@@ -172,7 +172,7 @@ class FleetGeometry(NamedTuple):
         point = self.tasks[:, None, None, task]
         mine = mine[..., None]
         return FleetState(
-            fleet.count + mine.squeeze(-1),
+            fleet.n_tasks + mine.squeeze(-1),
             fleet.total + point * mine,
             th.where(mine, point, fleet.last),
             th.where(mine, fleet.box.maximum(th.cat([point, -point], dim=-1)), fleet.box),
@@ -241,7 +241,7 @@ class FleetGeometry(NamedTuple):
         :param owners: ``(batch, n_samples, n_neighbours)`` int64, the UAVs of the task's :attr:`neighbours`
         :return: ``(batch, n_samples, n_uavs, N_FLEET_FEATURES)``
         """
-        n_uavs = fleet.count.shape[-1]
+        n_uavs = fleet.n_tasks.shape[-1]
         point = self.tasks.gather(1, task[..., None].expand(-1, -1, 2))[:, :, None]
         uavs = th.arange(n_uavs, device=task.device)[:, None]
         index = task[..., None].expand(-1, -1, self.neighbours.shape[-1])
@@ -251,9 +251,9 @@ class FleetGeometry(NamedTuple):
         votes = theirs.sum(-1) / theirs.any(2).sum(-1, keepdim=True).clamp(min=1)
 
         per_task = n_uavs / self.n_real[..., None]
-        load = (fleet.count + 1) * per_task
-        empty = (fleet.count == 0).to(load.dtype)
-        centroid = fleet.total / fleet.count.clamp(min=1.0)[..., None]
+        load = (fleet.n_tasks + 1) * per_task
+        empty = (fleet.n_tasks == 0).to(load.dtype)
+        centroid = fleet.total / fleet.n_tasks.clamp(min=1.0)[..., None]
         home = th.linalg.vector_norm(point, dim=-1)
         towards = (point * centroid).sum(-1) / (home * th.linalg.vector_norm(centroid, dim=-1)).clamp(min=NEAR**2)
         grown = fleet.box.maximum(th.cat([point, -point], dim=-1))

@@ -22,7 +22,7 @@ DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
-# Into how many views of an instance augmentation splits its samples: the symmetries, and for each the sweep in both directions.
+# Into how many views of an instance augmentation splits its samples: all symmetries, each swept in both directions.
 N_VIEWS = 2 * N_SYMMETRIES
 
 

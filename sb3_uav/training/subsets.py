@@ -96,7 +96,7 @@ class AllocatedSubsets:
             return self(batch_size, rng)
         own_rng = self.stream(self._n_chunks)
         self._n_chunks += 1
-        subsets = self._allocate(self.draw_batch(self.batches[own_rng.integers(len(self.batches))]), own_rng)
+        subsets = self._allocate(self.draw_batch(self.batches[int(own_rng.integers(len(self.batches)))]), own_rng)
         n_rows = max(round(batch_size * self.generator.min_tasks / subsets.n_tasks), 2)
         drawn = subsets[own_rng.permutation(len(subsets))[:n_rows]]
         return drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
