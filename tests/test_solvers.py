@@ -54,7 +54,8 @@ def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
     """Of any instance that is allowed; and as every task has a UAV, some task is visited if any can be reached."""
     reachable = batch.reachable().any(1).tolist()
     pair = make_pair(batch.n_uavs, decode="sampling", samples=3)
-    for solver in (*map(make_solver, SOLVERS), pair, make_pair(batch.n_uavs)):
+    augmented = make_pair(batch.n_uavs, decode="augment", samples=2 * dl_drl.N_TOURS)
+    for solver in (*map(make_solver, SOLVERS), pair, augmented, make_pair(batch.n_uavs)):
         objectives(solver, batch)
         visited = [result.schedule.n_visited > 0 for result in solver.solve(batch)]
         assert visited == reachable, solver.name
@@ -125,10 +126,11 @@ def test_greedy_is_the_policies_own_plan(instances: Instances) -> None:
     pair = make_pair()
     found = routes(pair, instances)
     for row, schedule in enumerate(found):
-        assignment = pair.allocator.decode_episodes(instances[row])[0, 0].tolist()
-        assert len(schedule) == 3
+        order = pair.allocator.task_order(instances[row])
+        assignment = pair.allocator.decode_episodes(instances[row].reorder(order))[0, 0].tolist()
+        assert len(schedule) == 3 and order[0].tolist() != sorted(order[0].tolist())
         for uav, route in enumerate(schedule):
-            mine = [task for task, owner in enumerate(assignment) if owner == uav]
+            mine = [task for task, owner in zip(order[0].tolist(), assignment, strict=True) if owner == uav]
             assert set(route) <= set(mine)
             if mine:
                 subset = Instances.from_arrays(instances.depot[row], instances.tasks[row, mine])
@@ -234,8 +236,35 @@ def test_policies_left_in_training_mode(instances: Instances) -> None:
 
 
 def test_wrong_fleet(instances: Instances) -> None:
+    """Only an allocator with a scorer for each UAV is bound to a fleet."""
+    bound = DLDRL(make_policy(AllocatorPolicy, 4, preset="paper"), make_policy(RouterPolicy))
     with pytest.raises(ValueError, match="trained for 4 UAVs, the instances have 3; use an allocator trained for 3"):
-        make_pair(4).solve(instances)
+        bound.solve(instances)
+    assert objectives(make_pair(4), instances).min() > 0
+
+
+def test_augmentation_is_never_worse_than_greedy(instances: Instances) -> None:
+    """The first view is the instance itself, and the first tour of each subset the greedy one."""
+    greedy = objectives(make_pair(), instances)
+    augmented = objectives(make_pair(decode="augment", samples=128), instances)
+    assert (augmented >= greedy).all() and augmented.sum() > greedy.sum()
+
+
+@pytest.mark.parametrize("samples", [1, 8, 50, 300])
+def test_augmentation_plans_no_more_tours_than_asked_for(
+    samples: int, instances: Instances, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = make_pair(decode="augment", samples=samples)
+    planned: list[int] = []
+    plan = pair.router.plan
+
+    def counting_plan(subsets: Instances, max_rows: int | None, n_tours: int, generator: th.Generator) -> th.Tensor:
+        planned.append(len(subsets) * n_tours)
+        return plan(subsets, max_rows, n_tours, generator)
+
+    monkeypatch.setattr(pair.router, "plan", counting_plan)
+    pair.solve(instances)
+    assert 0.6 * samples * 9 * 3 <= sum(planned) <= samples * 9 * 3
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch as th
+from torch.nn import functional
 
 from sb3_uav.envs.instances import euclidean
 
@@ -20,13 +21,13 @@ FARTHEST = 1.0
 # Distances below this are as good as 0.
 NEAR = 1e-3
 # How many tasks count as the neighbourhood of a task.
-N_DENSITY, N_NEIGHBOURS = 4, 8
+N_DENSITY, N_NEIGHBOURS, N_NEXT = 4, 8, 5
 
 # From which part of its share of the tasks on a UAV counts as full.
 FULL = 0.95
 
 N_NODE_FEATURES = 8
-N_MOVE_FEATURES = 7
+N_MOVE_FEATURES = 10
 N_FLEET_FEATURES = 16
 
 
@@ -74,17 +75,23 @@ class MoveGeometry(NamedTuple):
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param home: ``(batch, n_tasks + 1)``, distance to the depot
     :param max_distance: ``(batch, 1)``, in the unit of the instance
+    :param neighbours: ``(batch, n_tasks, n_next)`` int64, the nearest other tasks
+    :param neighbour_distance: ``(batch, n_tasks, n_next)``, ``FARTHEST`` where there are fewer
     """
 
     coordinates: th.Tensor
     home: th.Tensor
     max_distance: th.Tensor
+    neighbours: th.Tensor
+    neighbour_distance: th.Tensor
 
     @classmethod
     def of(cls, static: StaticObservation) -> MoveGeometry:
         """:param static: ``batch`` instances"""
         coordinates = scaled_coordinates(static)
-        return cls(coordinates, th.linalg.vector_norm(coordinates, dim=-1), static.max_distance)
+        distance = task_distances(coordinates, static.task_mask)
+        near, neighbours = distance.topk(min(N_NEXT, distance.shape[1]), largest=False)
+        return cls(coordinates, th.linalg.vector_norm(coordinates, dim=-1), static.max_distance, neighbours, near)
 
     def features(self, position: th.Tensor, remaining: th.Tensor, action_mask: th.Tensor) -> th.Tensor:
         """
@@ -92,18 +99,46 @@ class MoveGeometry(NamedTuple):
         :param remaining: ``(batch, n_samples)``, what it can still fly, in units of the maximum
         :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
         :return: ``(batch, n_samples, n_tasks + 1, N_MOVE_FEATURES)``: distance, logarithm of its ratio to that of the nearest
-            feasible node, distance home from there, slack left after it, detour, remaining distance, distance home from here
+            feasible node, distance home from there, slack left after it, detour, remaining distance, distance home from here;
+            and whether the move leaves something behind or leads on: distance of the node to its nearest feasible neighbour,
+            logarithm of its ratio to the distance of the move, part of its neighbours that are feasible
         """
         here = self.coordinates.gather(1, position[..., None].expand(-1, -1, 2))
         distance = euclidean(self.coordinates[:, None], here[:, :, None])
         nearest = distance.masked_fill(~action_mask, FARTHEST).amin(-1, keepdim=True)
-        ratio = ((distance + NEAR) / (nearest + NEAR)).log().clamp(-1.0, 5.0)
         home = self.home[:, None]
         home_here = self.home.gather(1, position)[..., None]
         left = remaining[..., None]
         slack = (left - distance - home).clamp(min=-FARTHEST)
-        fields = (distance, ratio, home, slack, distance + home - home_here, left, home_here)
+
+        shape = (*action_mask.shape[:2], *self.neighbours.shape[1:])
+        index = self.neighbours.flatten(1)[:, None].expand(-1, shape[1], -1)
+        near = self.neighbour_distance[:, None]
+        is_open = action_mask[..., 1:].gather(2, index).view(shape) & (near < FARTHEST)
+        onward = functional.pad(th.where(is_open, near, FARTHEST).amin(-1), (1, 0), value=FARTHEST)
+        openness = functional.pad(is_open.sum(-1).to(distance.dtype) / shape[-1], (1, 0))
+        fields = (
+            8 * distance,
+            log_ratio(distance, nearest),
+            4 * home,
+            4 * slack,
+            4 * (distance + home - home_here),
+            left,
+            4 * home_here,
+            8 * onward.clamp(max=0.25),
+            log_ratio(onward, distance),
+            openness,
+        )
         return th.stack([field.expand_as(distance) for field in fields], dim=-1)
+
+
+def log_ratio(a: th.Tensor, b: th.Tensor) -> th.Tensor:
+    """
+    :param a: Distances
+    :param b: Distances, broadcast against ``a``
+    :return: Logarithm of their ratio, at most 5 in magnitude
+    """
+    return ((a + NEAR).log() - (b + NEAR).log()).clamp(-5.0, 5.0)
 
 
 class FleetState(NamedTuple):
@@ -258,7 +293,7 @@ class FleetGeometry(NamedTuple):
         towards = (point * centroid).sum(-1) / (home * th.linalg.vector_norm(centroid, dim=-1)).clamp(min=NEAR**2)
         grown = fleet.box.maximum(th.cat([point, -point], dim=-1))
         perimeter = fleet.box.sum(-1)
-        relative = (nearest + NEAR).log() - (nearest.amin(-1, keepdim=True) + NEAR).log()
+        relative = log_ratio(nearest, nearest.amin(-1, keepdim=True))
         fields = (
             load,
             (load - FULL).clamp(min=0.0),

@@ -22,8 +22,10 @@ DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
-# Into how many views of an instance augmentation splits its samples: all symmetries, each swept in both directions.
+# Augmentation looks at an instance in so many views, all symmetries swept in both directions, and tries so many tours for each
+# subset of tasks; allocations times tours are the samples.
 N_VIEWS = 2 * N_SYMMETRIES
+N_TOURS = 8
 
 
 def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
@@ -44,13 +46,13 @@ class DLDRL(Solver):
     DL-DRL: an allocator and a router, both trained.
 
     What it finds for an instance depends on the seed and the row of the instance, not on ``batch_size`` (but for rounding
-    errors of the networks). The router is always greedy.
+    errors of the networks). The router is greedy, except with ``"augment"``.
 
     :param allocator: The upper level's policy
     :param router: The lower level's policy
-    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to draw them
-        from several views of the instance: its symmetries, and other task orders where the allocator has some
-    :param samples: Number of sampled allocations per instance
+    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to spend
+        the samples on views of the instance (its symmetries, the sweep in both directions) and on several tours per UAV
+    :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: How tables and files call it; says how it decodes when None
     :raises ValueError: If an argument is not allowed
@@ -97,7 +99,7 @@ class DLDRL(Solver):
     def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
         self.check(instances)
         self.allocator.set_training_mode(False)
-        n_samples = 1 if self.decode == "greedy" else max(size for _, _, size in self._blocks())
+        n_samples = 1 if self.decode == "greedy" else SAMPLE_BLOCK
         fitting = self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
         batch_size = min(self.batch_size or fitting, fitting)
         results = []
@@ -108,16 +110,6 @@ class DLDRL(Solver):
             results += [SolverResult(schedule, seconds, len(rows)) for schedule in found]
         return results
 
-    def _blocks(self) -> list[tuple[int, int, int]]:
-        """View, index of the first sample and number of samples of what is decoded at once."""
-        if self.decode == "greedy":
-            return [(0, 0, 1)]
-        if self.decode == "sampling":
-            return [(0, first, min(SAMPLE_BLOCK, self.samples - first)) for first in range(0, self.samples, SAMPLE_BLOCK)]
-        n_views = min(N_VIEWS, self.samples)
-        bounds = [self.samples * view // n_views for view in range(n_views + 1)]
-        return [(view, bounds[view], bounds[view + 1] - bounds[view]) for view in range(n_views)]
-
     def _solve_batch(self, instances: Instances, rows: list[int], seed: int) -> list[Schedule]:
         """
         :param instances: ``batch`` instances
@@ -127,30 +119,50 @@ class DLDRL(Solver):
         """
         n_tasks = max(int(instances.task_mask.sum(1).max()), 1)
         instances = instances.trim(n_tasks).to(self.allocator.device)
+        if self.decode == "augment":
+            return [self._augment(instances[i], random_generator(instances, seed, row)) for i, row in enumerate(rows)]
+        order = self.allocator.task_order(instances)
+        instances = instances.reorder(order)
+        with th.no_grad():
+            cache = self.allocator.encode(instances)
+        if self.decode == "greedy":
+            planned = plan_tours(instances, self.allocator.decode_episodes(instances, cache=cache), self.router.plan)
+            return schedules(in_input_order(planned.tours[:, 0], order))
         best_value = th.full((len(instances),), -th.inf, dtype=th.float64, device=instances.device)
         best = [Schedule([])] * len(instances)
-        seen, cache = -1, None
-        for view, first, n_samples in self._blocks():
-            if view != seen:
-                seen, shown = view, reflect(instances, view // 2)
-                order = self.allocator.task_order(shown, view % 2)
-                shown = shown.reorder(order)
-                with th.no_grad():
-                    cache = self.allocator.encode(shown)
-            assert cache is not None
-            if self.decode == "greedy":
-                assignment = self.allocator.decode_episodes(shown, cache=cache)
-            else:
-                assignment = self._sample_block(shown, cache, rows, seed, first)[:, :n_samples]
-            planned = plan_tours(shown, assignment, self.router.plan)
+        for first in range(0, self.samples, SAMPLE_BLOCK):
+            n_samples = min(SAMPLE_BLOCK, self.samples - first)
+            assignment = self._sample_block(instances, cache, rows, seed, first)[:, :n_samples]
+            planned = plan_tours(instances, assignment, self.router.plan)
             value, sample = planned.value.max(1)
-            tours = planned.tours[th.arange(len(instances), device=sample.device), sample]
-            tours = order.gather(1, tours.clamp(min=0).flatten(1)).view_as(tours).masked_fill(tours < 0, -1)
+            tours = in_input_order(planned.tours[th.arange(len(instances), device=sample.device), sample], order)
             for row, (schedule, better) in enumerate(zip(schedules(tours), (value > best_value).tolist(), strict=True)):
                 if better:
                     best[row] = schedule
             best_value = th.maximum(best_value, value)
         return best
+
+    def _augment(self, instance: Instances, generator: th.Generator) -> Schedule:
+        """
+        :param instance: A batch of one
+        :param generator: The source of randomness
+        :return: The best schedule of all views, of which each begins with a greedy allocation
+        """
+        n_tours = min(N_TOURS, self.samples)
+        n_allocations = self.samples // n_tours
+        n_views = min(N_VIEWS, n_allocations)
+        shown = [reflect(instance, view // 2) for view in range(n_views)]
+        orders = th.cat([self.allocator.task_order(view, number % 2) for number, view in enumerate(shown)])
+        views = Instances.concatenate(shown).reorder(orders)
+        with th.no_grad():
+            cache = self.allocator.encode(views)
+        assignment = self.allocator.decode_episodes(views, cache=cache)
+        if n_allocations > n_views:
+            sampled = self.allocator.decode_episodes(views, n_allocations // n_views - 1, False, generator, cache)
+            assignment = th.cat([assignment, sampled], dim=1)
+        planned = plan_tours(views, assignment, lambda subsets: self.router.plan(subsets, None, n_tours, generator))
+        view, sample = divmod(int(planned.value.argmax()), assignment.shape[1])
+        return schedules(in_input_order(planned.tours[view : view + 1, sample], orders[view : view + 1]))[0]
 
     def _sample_block(self, instances: Instances, cache: Cache, rows: list[int], seed: int, first: int) -> th.Tensor:
         """
@@ -163,17 +175,30 @@ class DLDRL(Solver):
         :param rows: Their indices in what is being solved
         :param seed: Of the samples
         :param first: Index of the first sample of the block
-        :return: ``(batch, block, n_tasks)`` int64; of augmentation, the first one is greedy
+        :return: ``(batch, SAMPLE_BLOCK, n_tasks)`` int64
         """
-        augments = self.decode == "augment"
-        n_samples = max(size for _, _, size in self._blocks()) if augments else SAMPLE_BLOCK
         blocks = []
         for i, row in enumerate(rows):
-            state = np.random.SeedSequence([seed, row, first]).generate_state(1, np.uint64)
-            generator = th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+            generator = random_generator(instances, seed, row, first)
             own = Cache(cache.nodes[i : i + 1], tuple(projection[i : i + 1] for projection in cache.projections))
-            block = self.allocator.decode_episodes(instances[i], n_samples, False, generator, own)
-            if augments:
-                block[:, :1] = self.allocator.decode_episodes(instances[i], cache=own)
-            blocks.append(block)
+            blocks.append(self.allocator.decode_episodes(instances[i], SAMPLE_BLOCK, False, generator, own))
         return th.cat(blocks)
+
+
+def random_generator(instances: Instances, *seed: int) -> th.Generator:
+    """
+    :param instances: On the device where random numbers are needed
+    :param seed: What the random numbers depend on
+    """
+    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+    return th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+
+
+def in_input_order(tours: th.Tensor, order: th.Tensor) -> th.Tensor:
+    """
+    :param tours: ``(batch, n_uavs, n_steps)`` int64, places of tasks in the order, -1 as padding
+    :param order: ``(batch, n_tasks)`` int64, which task stands in each place
+    :return: The tours with the tasks themselves
+    """
+    tasks = order.gather(1, tours.clamp(min=0).flatten(1)).view_as(tours)
+    return tasks.masked_fill(tours < 0, -1)
