@@ -1,5 +1,5 @@
-from sb3_uav.training.fixed_set import FixedSetCallback
+from sb3_uav.training.size_grid import SizeGridCallback
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.its import ITSCallback
 
-__all__ = ["FixedSetCallback", "Freezer", "ITSCallback"]
+__all__ = ["SizeGridCallback", "Freezer", "ITSCallback"]

@@ -15,13 +15,13 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import DLDRL
-from sb3_uav.training import FixedSetCallback, ITSCallback
+from sb3_uav.training import SizeGridCallback, ITSCallback
 
 SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 SIZES = [[2, 9, 4], [3, 12, 2]]
 
 
-def train(folder: Path, freq: int = 2) -> tuple[FixedSetCallback, Any]:
+def train(folder: Path, freq: int = 2) -> tuple[SizeGridCallback, Any]:
     env = BatchedVecEnv([lambda: TaskAllocationEnv(8, 2)] * 4)
     kwargs: dict[str, Any] = dict(learning_rate=1e-2, instances_per_epoch=8, seed=0, device="cpu", policy_kwargs=SMALL)
     model = REINFORCE(AllocatorPolicy, env, **kwargs)
@@ -31,7 +31,7 @@ def train(folder: Path, freq: int = 2) -> tuple[FixedSetCallback, Any]:
         n_pretraining_epochs=1,
         save_path=str(folder),
     )
-    fixed = FixedSetCallback(SIZES, max_distance=1.5, freq=freq)
+    fixed = SizeGridCallback(SIZES, max_distance=1.5, freq=freq)
     model.learn(10**9, callback=[its, fixed])
     return fixed, model
 
@@ -39,7 +39,7 @@ def train(folder: Path, freq: int = 2) -> tuple[FixedSetCallback, Any]:
 def test_best_pair_is_kept_and_is_as_good_as_recorded(tmp_path: Path) -> None:
     """By the solver and the independent checker, from the files alone."""
     fixed, _ = train(tmp_path)
-    with (tmp_path / "fixed_set.csv").open() as file:
+    with (tmp_path / "size_grid.csv").open() as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
     assert [row["updates"] for row in rows] == [0, 2, 4, 6]
     best = max(rows, key=lambda row: row["score"])
@@ -60,7 +60,7 @@ def test_evaluation_does_not_disturb_training(tmp_path: Path) -> None:
 
 def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="freq is 0"):
-        FixedSetCallback(freq=0)
+        SizeGridCallback(freq=0)
     model = REINFORCE("RouterPolicy", BatchedVecEnv([lambda: RoutePlanningEnv(5)] * 2), policy_kwargs=SMALL, device="cpu")
     with pytest.raises(ValueError, match="needs an AllocatorPolicy on a TaskAllocation environment"):
-        model.learn_instances(4, FixedSetCallback(SIZES))
+        model.learn_instances(4, SizeGridCallback(SIZES))

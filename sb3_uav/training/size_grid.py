@@ -1,4 +1,4 @@
-"""Evaluation on a fixed set of instances of several sizes, keeping the best pair."""
+"""Evaluation on fixed instances of several sizes, keeping the best pair."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from sb3_uav.training.its import ITSCallback, walk_callbacks, write_atomically
 # UAVs, tasks, instances.
 DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
 # Far from every stream of the training.
-FIXED_SEED = 30_000_001
+GRID_SEED = 30_000_001
 
 
-class FixedSetCallback(BaseCallback):
+class SizeGridCallback(BaseCallback):
     """
     Evaluates allocator and router on the same instances again and again, both greedy and with the fused driver.
 
-    Writes ``fixed_set.csv`` (mean objective by size) and, whenever the geometric mean over the sizes is better than ever,
+    Writes ``size_grid.csv`` (mean objective by size) and, whenever the geometric mean over the sizes is better than ever,
     ``best_allocator.zip`` and, next to an :class:`~sb3_uav.training.ITSCallback`, ``best_router.zip``.
 
     :param sizes: UAVs, tasks and number of instances of each part
@@ -54,7 +54,7 @@ class FixedSetCallback(BaseCallback):
         self.save_path = None if save_path is None else Path(save_path)
         self.parts = {
             f"U{n_uavs}-N{n_tasks}": UniformGenerator(n_tasks, n_uavs, max_distance)(
-                n_instances, np.random.default_rng([FIXED_SEED, n_uavs, n_tasks])
+                n_instances, np.random.default_rng([GRID_SEED, n_uavs, n_tasks])
             )
             for n_uavs, n_tasks, n_instances in sizes
         }
@@ -64,7 +64,7 @@ class FixedSetCallback(BaseCallback):
     def _on_training_start(self) -> None:
         problem = find_problem(self.training_env)
         if not isinstance(problem, AllocationProblem) or not isinstance(self.model.policy, AllocatorPolicy):
-            raise ValueError(f"FixedSetCallback needs an AllocatorPolicy on a TaskAllocation environment, found {problem}.")
+            raise ValueError(f"SizeGridCallback needs an AllocatorPolicy on a TaskAllocation environment, found {problem}.")
         self.problem = problem
         self._start = time.time()
 
@@ -97,7 +97,7 @@ class FixedSetCallback(BaseCallback):
         seconds = round(time.time() - self._start, 1)
         self.records.append({"updates": self.model._n_updates, "seconds": seconds, **objectives, "score": score})
         for name, objective in objectives.items():
-            self.logger.record(f"fixed_set/{name}", objective)
+            self.logger.record(f"size_grid/{name}", objective)
         if self.verbose > 0:
             found = ", ".join(f"{name} {objective:.2f}" for name, objective in objectives.items())
             print(f"update {self.model._n_updates}: {found}, score {score:.4f}", flush=True)
@@ -107,7 +107,7 @@ class FixedSetCallback(BaseCallback):
             writer = csv.DictWriter(text, list(self.records[0]))
             writer.writeheader()
             writer.writerows(self.records)
-            write_atomically(folder / "fixed_set.csv", text.getvalue())
+            write_atomically(folder / "size_grid.csv", text.getvalue())
             if score > self.best_score:
                 save_atomically(self.model, folder / "best_allocator.zip")
                 if its is not None:
