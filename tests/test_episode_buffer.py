@@ -308,6 +308,30 @@ def test_foreign_algorithms_policies_buffers_and_spaces_are_refused():
         EpisodeRolloutBuffer(2, spaces.Dict({"depot": spaces.Box(0, 1, (2,))}), env.action_space)
 
 
+# ------------------------------------------------------------------------------------------ masks
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, MaskablePPO])
+def test_a_thousand_actions_train_and_only_legal_ones_are_taken(algorithm):
+    """A thousand actions used to break the masked categorical (sb3-contrib issues 81 and 247)."""
+    kwargs = {} if algorithm is A2C else {"batch_size": 8, "n_epochs": 1}
+    env = BatchedVecEnv([lambda: RoutePlanningEnv(999)] * 2)
+    network = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
+    illegal: list[int] = []
+
+    class CountIllegal(BaseCallback):
+        def _on_step(self) -> bool:
+            illegal.extend(info["illegal_actions"] for info in self.locals["infos"])
+            return True
+
+    model = algorithm(
+        RouterPolicy, env, n_steps=8, policy_kwargs=network, rollout_buffer_class=BUFFERS[algorithm], device="cpu", **kwargs
+    )
+    model.learn(32, callback=CountIllegal())
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    assert len(illegal) == 32 and not any(illegal)
+
+
 # ------------------------------------------------------------------------------------------ learning
 
 
