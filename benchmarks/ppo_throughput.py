@@ -4,7 +4,8 @@ What encoding an instance once per episode is worth to PPO: environment steps pe
 ``every step`` is what SB3 does with any extractor: ``DummyVecEnv``, ``DictRolloutBuffer``, an encoding for every step, in
 collection and in training. ``once`` is ``BatchedVecEnv``, ``EpisodeRolloutBuffer`` and the policy's cache. The algorithm, the
 network and all settings are the same; so are the environment steps. Every measurement has a process of its own, whose peak
-memory is that above what it took before the algorithm was made.
+memory is that above what it took before the algorithm was made. An episode of the allocator has N steps; one of the router has
+as many as it visits tasks, few before any training, and the ratio cannot be more than that.
 
     python benchmarks/ppo_throughput.py --n-tasks 20 80 200
 """
@@ -52,8 +53,9 @@ def measure(level: str, n_tasks: int, once: bool, args: argparse.Namespace) -> M
     env = (BatchedVecEnv if once else DummyVecEnv)([make_env] * args.n_envs)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     n_steps = n_tasks if level == "allocator" else 20
+    policy: Any = AllocatorPolicy if level == "allocator" else RouterPolicy
     model = PPO(
-        AllocatorPolicy if level == "allocator" else RouterPolicy,
+        policy,
         env,
         n_steps=n_steps,
         batch_size=n_steps * args.n_envs // args.n_minibatches,
@@ -63,9 +65,8 @@ def measure(level: str, n_tasks: int, once: bool, args: argparse.Namespace) -> M
         device="cpu",
         seed=0,
     )
-    assert isinstance(model.policy, AllocatorPolicy | RouterPolicy)
-    model.policy.features_extractor.use_cache = once
-    model.policy.features_extractor.share_encodings = once
+    extractor: Any = model.policy.features_extractor
+    extractor.use_cache = extractor.share_encodings = once
     if once:
         # The slow side needs no warming up: its cycle is long enough.
         model.learn(n_steps * args.n_envs)

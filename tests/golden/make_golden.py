@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def main() -> None:
             settings: dict[str, Any] = dict(policy_kwargs=NETWORK, learning_rate=0.01, device="cpu", seed=0)
             if name in ("ppo", "ppo_mask"):
                 settings.update(n_steps=12, batch_size=24)
-            env = BatchedVecEnv([lambda level=level: make_env(level)] * 4)
+            env = BatchedVecEnv([partial(make_env, level)] * 4)
             model = algorithm(policy, env, **settings)
             model.learn(480)
             model.save(FOLDER / f"{name}-{level}")
