@@ -16,6 +16,7 @@ from sb3_uav.policies.geometry import (
     FARTHEST,
     FULL,
     N_NEIGHBOURS,
+    NEAR,
     FleetGeometry,
     MoveGeometry,
     node_features,
@@ -57,8 +58,10 @@ def test_features_of_a_move() -> None:
     mask = th.tensor([[[False, False, True, False, True]]])
     geometry = MoveGeometry.of(static_of(instances))
     features = geometry.features(th.tensor([[1]]), th.tensor([[2.5 / 4]]), mask)[0, 0]
-    ratio = math.log((0.5 + 1e-3) / (0.125 + 1e-3))
-    expected = [0.5, ratio, 0.625, (2.5 - 2.0 - 2.5) / 4, (2.0 + 2.5 - 1.5) / 4, 2.5 / 4, 1.5 / 4]
+    slack, detour, left = 2.5 - 2.0 - 2.5, 2.0 + 2.5 - 1.5, 2.5 / 4
+    # From there the one feasible neighbour of three others (and itself) is 1.5 away.
+    ratio, onward = math.log((0.5 + NEAR) / (0.125 + NEAR)), math.log((0.375 + NEAR) / (0.5 + NEAR))
+    expected = [8 * 0.5, ratio, 2.5, slack, detour, left, 1.5, 8 * 0.25, onward, 1 / 4]
     assert features[2].tolist() == pytest.approx(expected, abs=1e-5)
     assert features[4, 1] == 0
 

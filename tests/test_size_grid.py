@@ -15,7 +15,7 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import DLDRL
-from sb3_uav.training import SizeGridCallback, ITSCallback
+from sb3_uav.training import ITSCallback, SizeGridCallback
 
 SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 SIZES = [[2, 9, 4], [3, 12, 2]]

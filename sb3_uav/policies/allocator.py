@@ -14,7 +14,7 @@ from sb3_uav.envs.instances import Instances, UniformGenerator
 from sb3_uav.envs.sweep import sweep_order
 from sb3_uav.policies.base import PRESETS, Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import StaticObservation
-from sb3_uav.policies.geometry import N_FLEET_FEATURES, FleetGeometry
+from sb3_uav.policies.geometry import N_FLEET_FEATURES, FleetGeometry, FleetState
 
 # Hidden size of the scorer.
 SCORER_DIM = 64
@@ -148,19 +148,42 @@ class AllocatorExtractor(EpisodicExtractor):
         return FleetGeometry(*cache.projections[1:]) if self.geometry else None
 
     def observed_state(self, cache: Cache, observation: TensorDict) -> AllocatorState:
-        assignment = observation["assignment"][:, None]
-        n_uavs = observation["action_mask"].shape[-1]
-        uavs = th.arange(n_uavs, device=assignment.device)
-        mine = assignment[..., None] == uavs
-        # The depot belongs to every UAV and bounds the maximum from below, so it can stand in for other UAVs' tasks.
-        tasks, depot = cache.nodes[:, None, 1:, None], cache.nodes[:, None, :1, None]
-        context = th.where(mine[..., None], tasks, depot).amax(2)
-        task = observation["current_task"].long().clamp(max=cache.nodes.shape[1] - 2)
-        geometry = self.fleet_geometry(cache)
-        features = None
-        if geometry is not None:
-            features = geometry.features(geometry.of_assignment(mine), task, geometry.owners(task, assignment.long()))
+        assignment, current_task = observation["assignment"], observation["current_task"].long().squeeze(-1)
+        n_tasks = assignment.shape[-1]
+        task, uavs = (
+            current_task.clamp(max=n_tasks - 1),
+            th.arange(observation["action_mask"].shape[-1], device=cache.nodes.device),
+        )
+        geometry, fleet, features = self.fleet_geometry(cache), None, None
+        final = assignment.gather(1, current_task.argmax(1)[:, None, None].expand(-1, 1, n_tasks))
+        decided = th.arange(n_tasks, device=assignment.device) < current_task[..., None]
+        if assignment.shape[1] > 1 and (assignment == final.where(decided, UNASSIGNED)).all():
+            # Steps of one episode: one running maximum serves them all.
+            mine = final[..., None] == uavs
+            context = at_steps(self.running_context(cache, mine), current_task)
+            if geometry is not None:
+                fleet = FleetState(*(at_steps(field, current_task) for field in geometry.of_prefixes(mine)))
+        else:
+            mine = assignment[..., None] == uavs
+            # The depot belongs to every UAV and bounds the maximum from below, so it can stand in for other UAVs' tasks.
+            context = th.where(mine[..., None], cache.nodes[:, None, 1:, None], cache.nodes[:, None, :1, None]).amax(2)
+            if geometry is not None:
+                fleet = geometry.of_assignment(mine)
+        if geometry is not None and fleet is not None:
+            features = geometry.features(fleet, task, geometry.owners(task, assignment.long()))
         return AllocatorState(context, task, features)
+
+    def running_context(self, cache: Cache, mine: th.Tensor) -> th.Tensor:
+        """
+        What every UAV holds before and after each step of complete episodes.
+
+        :param cache: Of ``batch`` instances
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is
+        :return: ``(batch, n_samples, n_tasks + 1, n_uavs, embed_dim)``
+        """
+        depot, tasks = cache.nodes[:, None, :1, None], cache.nodes[:, None, 1:, None]
+        first = depot.expand(-1, mine.shape[1], 1, mine.shape[3], -1)
+        return th.cat([first, th.where(mine[..., None], tasks, depot)], dim=2).cummax(dim=2).values
 
     def initial_context(self, cache: Cache, n_samples: int, n_uavs: int) -> th.Tensor:
         """
@@ -181,6 +204,16 @@ class AllocatorExtractor(EpisodicExtractor):
             return th.cat([self.scorer(state.context, task, state.features), task_embedding], dim=-1)
         subset_embedding = self.feed_forward(self.project_context(state.context.flatten(2)))
         return th.cat([subset_embedding, task_embedding], dim=-1)
+
+
+def at_steps(running: th.Tensor, steps: th.Tensor) -> th.Tensor:
+    """
+    :param running: ``(batch, 1, n_steps, ...)``, something at every step of an episode
+    :param steps: ``(batch, n_samples)`` int64
+    :return: ``(batch, n_samples, ...)``, the same at these steps
+    """
+    index = steps.view(*steps.shape, *[1] * (running.dim() - 3)).expand(-1, -1, *running.shape[3:])
+    return running[:, 0].gather(1, index)
 
 
 class AllocatorPolicy(EpisodicPolicy):
@@ -253,18 +286,14 @@ class AllocatorPolicy(EpisodicPolicy):
     def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[AllocatorState, th.Tensor]:
         self.check_fleet(instances)
         batch_size, n_samples, n_tasks = actions.shape
-        uavs = th.arange(instances.n_uavs, device=actions.device)
-        mine = actions[..., None] == uavs
-        depot, tasks = cache.nodes[:, None, :1, None], cache.nodes[:, None, 1:, None]
-        # What the UAV holds before step t is the running maximum over the tasks before t, the depot first.
-        held = th.where(mine[..., None], tasks, depot)[:, :, :-1]
-        first = depot.expand(-1, n_samples, 1, instances.n_uavs, -1)
-        context = th.cat([first, held], dim=2).cummax(dim=2).values.flatten(1, 2)
+        mine = actions[..., None] == th.arange(instances.n_uavs, device=actions.device)
+        context = self.features_extractor.running_context(cache, mine)[:, :, :-1].flatten(1, 2)
         task = th.arange(n_tasks, device=actions.device).expand(batch_size, n_samples, n_tasks).flatten(1)
         geometry = self.features_extractor.fleet_geometry(cache)
         features = None
         if geometry is not None:
-            features = geometry.features(geometry.of_prefixes(mine), task, geometry.all_owners(actions))
+            fleet = FleetState(*(field[:, :, :-1].flatten(1, 2) for field in geometry.of_prefixes(mine)))
+            features = geometry.features(fleet, task, geometry.all_owners(actions))
         action_mask = th.ones(1, 1, instances.n_uavs, dtype=th.bool, device=actions.device)
         return AllocatorState(context, task, features), action_mask
 

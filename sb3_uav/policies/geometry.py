@@ -216,23 +216,20 @@ class FleetGeometry(NamedTuple):
     def of_prefixes(self, mine: th.Tensor) -> FleetState:
         """
         :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is
-        :return: The fleets before each task, with all tasks of all samples in the place of the samples
+        :return: The fleets before each task and after the last, ``(batch, n_samples, n_tasks + 1, n_uavs, ...)``
         """
-        before = th.cat([th.zeros_like(mine[:, :, :1]), mine[:, :, :-1]], dim=2)
-        points = th.cat([self.coordinates[:, :1], self.tasks[:, :-1]], dim=1)[:, None, :, None]
-        steps = th.arange(before.shape[2], device=before.device)[:, None]
-        newest = (steps * before).cummax(2).values
-        rows = points.expand(-1, before.shape[1], -1, before.shape[3], -1)
-        last = rows.gather(2, newest[..., None].expand_as(rows))
-        held = before[..., None]
-        signed = th.cat([points, -points], dim=-1)
-        state = FleetState(
-            before.cumsum(2).to(points.dtype),
+        # What the node before each task adds; the depot adds nothing.
+        added = th.cat([th.zeros_like(mine[:, :, :1]), mine], dim=2)
+        points = self.coordinates[:, None, :, None]
+        newest = (th.arange(added.shape[2], device=added.device)[:, None] * added).cummax(2).values
+        rows = points.expand(-1, added.shape[1], -1, added.shape[3], -1)
+        held = added[..., None]
+        return FleetState(
+            added.cumsum(2).to(points.dtype),
             (points * held).cumsum(2),
-            last,
-            (signed * held).cummax(2).values,
+            rows.gather(2, newest[..., None].expand_as(rows)),
+            (th.cat([points, -points], dim=-1) * held).cummax(2).values,
         )
-        return FleetState(*(field.flatten(1, 2) for field in state))
 
     def of_assignment(self, mine: th.Tensor) -> FleetState:
         """

@@ -17,7 +17,8 @@ from sb3_uav.envs.instances import Instances, UniformGenerator
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.training.its import ITSCallback, walk_callbacks, write_atomically
+from sb3_uav.training.common import siblings, write_atomically
+from sb3_uav.training.its import ITSCallback
 
 # UAVs, tasks, instances.
 DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
@@ -69,7 +70,7 @@ class SizeGridCallback(BaseCallback):
         self._start = time.time()
 
     def _its(self) -> ITSCallback | None:
-        found = [callback for callback in walk_callbacks(self.locals.get("callback")) if isinstance(callback, ITSCallback)]
+        found = siblings(self, ITSCallback)
         return found[0] if found else None
 
     def _on_rollout_start(self) -> None:
