@@ -242,6 +242,11 @@ class AllocatorPolicy(EpisodicPolicy):
         given = self._own_parameters["sweep"]
         return PRESETS[self._own_parameters["preset"]]["sweep"] if given is None else given
 
+    @property
+    def env_order(self) -> str:
+        """The ``task_order`` of the environments that suit it."""
+        return "sweep" if self.sweep else "input"
+
     def task_order(self, instances: Instances, variant: int = 0) -> th.Tensor:
         if not self.sweep:
             return super().task_order(instances)

@@ -93,7 +93,7 @@ def hand_over_router(callback: BaseCallback, router: Router) -> None:
     for env in (callback.training_env, *(evaluation.eval_env for evaluation in siblings(callback, EvalCallback))):
         env.env_method("set_router", router)
         if isinstance(callback.model.policy, AllocatorPolicy):
-            env.env_method("set_task_order", "sweep" if callback.model.policy.sweep else "input")
+            env.env_method("set_task_order", callback.model.policy.env_order)
 
 
 @contextmanager
