@@ -20,6 +20,7 @@ OK, INFEASIBLE, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 FORWARDED = {
     "train": ("sb3_uav.zoo.train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
     "enjoy": ("sb3_uav.zoo.enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
+    "compare": ("sb3_uav.zoo.compare", "train algorithms at an equal budget and compare them"),
     "demo": ("sb3_uav.zoo.demo", "train and evaluate a small scenario in a few minutes"),
 }
 
