@@ -31,8 +31,8 @@ settings = dict(
     policy_kwargs=dict(embed_dim=32, n_layers=2, n_heads=4, ff_dim=64),
     rollout_buffer_class=EpisodeRolloutBuffer,
 )
-# An episode of the allocator has 20 steps. Its one reward comes at the end: no discount, no decay of advantages.
-allocator = PPO(AllocatorPolicy, env, n_steps=20, gae_lambda=1.0, seed=0, **settings)
+# An episode of the allocator has 20 steps, its one reward comes with the last.
+allocator = PPO(AllocatorPolicy, env, n_steps=20, gae_lambda=0.95, ent_coef=0.01, seed=0, **settings)
 router = dict(algo="ppo", policy="RouterPolicy", n_envs=64, n_steps=20, gae_lambda=0.98, **settings)
 n_epochs = 6
 its = ITSCallback(

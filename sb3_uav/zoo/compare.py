@@ -254,7 +254,8 @@ def check_settings(args: argparse.Namespace, needs_router: bool) -> None:
         "router": hashlib.sha256((args.out / ROUTER_FILE).read_bytes()).hexdigest() if needs_router else None,
     }
     path = args.out / SETTINGS_FILE
-    if path.is_file():
+    # A folder without runs binds nobody.
+    if path.is_file() and any((args.out / "runs").glob("*/seed_*")):
         for key, before in json.loads(path.read_text()).items():
             if settings[key] != before:
                 raise ValueError(
