@@ -25,11 +25,12 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)
 	$(BIN)/python -m sb3_uav.zoo.demo --out demo
 
+# One process per core, and one thread in each: threads that wait for a busy core cost more than they bring.
 test: $(INSTALLED)  ## Run the whole test suite
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(PYTEST_ARGS)
 
 test-fast: $(INSTALLED)  ## Run the tests without the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_ARGS)
 
 lint: $(INSTALLED)  ## Look for mistakes with ruff
 	$(BIN)/ruff check $(LINT_PATHS)
