@@ -87,12 +87,12 @@ class Stub(Solver):
     def __init__(self, routes: Sequence[Sequence[int]] = ()) -> None:
         self.routes = routes
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         return [SolverResult(Schedule(self.routes), 0.5, len(instances)) for _ in range(len(instances))]
 
 
 class Interrupted(Stub):
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         raise KeyboardInterrupt
 
 

@@ -31,13 +31,13 @@ def make_pair(n_uavs: int = 3, **kwargs: Any) -> DLDRL:
 
 
 def objectives(solver: Solver, instances: Instances, seed: int = 0) -> np.ndarray:
-    results = solver.solve(instances, seed)
+    results = solver.solve(instances, seed=seed)
     assert len(results) == len(instances)
     return np.array([check_schedule(instances, row, result.schedule).objective for row, result in enumerate(results)])
 
 
 def routes(solver: Solver, instances: Instances, seed: int = 0) -> list[tuple[tuple[int, ...], ...]]:
-    return [result.schedule.routes for result in solver.solve(instances, seed)]
+    return [result.schedule.routes for result in solver.solve(instances, seed=seed)]
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +141,8 @@ def test_greedy_is_the_policies_own_plan(instances: Instances) -> None:
 def test_batch_size_changes_only_the_timing(decode: str, batch_size: int, instances: Instances) -> None:
     pair = make_pair(decode=decode, samples=5)
     batched = make_pair(decode=decode, samples=5, batch_size=batch_size)
-    results = batched.solve(instances, 2)
-    assert [result.schedule for result in results] == [result.schedule for result in pair.solve(instances, 2)]
+    results = batched.solve(instances, seed=2)
+    assert [result.schedule for result in results] == [result.schedule for result in pair.solve(instances, seed=2)]
     sizes = {1: [1] * 9, 4: [4] * 8 + [1], 100: [9] * 9}[batch_size]
     assert [result.batch_size for result in results] == sizes
     assert all(result.seconds > 0 for result in results)
@@ -151,9 +151,9 @@ def test_batch_size_changes_only_the_timing(decode: str, batch_size: int, instan
 def test_memory_bounds_the_batch(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
     """With hardly any memory, instances are solved one by one, and nothing else changes."""
     pair = make_pair(decode="sampling", samples=3)
-    roomy = pair.solve(instances, 0)
+    roomy = pair.solve(instances, seed=0)
     monkeypatch.setattr(memory, "CPU_MEMORY", 1)
-    tight = pair.solve(instances, 0)
+    tight = pair.solve(instances, seed=0)
     assert [result.batch_size for result in tight] == [1] * 9
     assert [result.schedule for result in tight] == [result.schedule for result in roomy]
     monkeypatch.undo()

@@ -1,4 +1,4 @@
-from sb3_uav.solvers.base import SOLVERS, OneByOneSolver, Solver, SolverResult, make_solver
+from sb3_uav.solvers.base import SOLVERS, OneByOneSolver, Solution, Solver, SolverResult, make_solver
 from sb3_uav.solvers.dl_drl import DLDRL
 from sb3_uav.solvers.evaluation import SummaryRow, evaluate, print_table
 
@@ -6,6 +6,7 @@ __all__ = [
     "DLDRL",
     "SOLVERS",
     "OneByOneSolver",
+    "Solution",
     "Solver",
     "SolverResult",
     "SummaryRow",

@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
@@ -50,33 +50,46 @@ class Solver(ABC):
         """
 
     @abstractmethod
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         """
         :param instances: ``batch`` instances on the CPU, possibly padded
-        :param seed: Of all the randomness; the same seed gives the same schedules
+        :param time_limit: Seconds per instance for solvers that can use more or less of them; their own default when None.
+            Others ignore it
+        :param seed: Of all the randomness; without a time limit the same seed gives the same schedules
         :return: One result per instance
         :raises ValueError: If the solver cannot treat these instances, see :meth:`check`
         """
+
+
+class Solution(NamedTuple):
+    """
+    :param schedule: The schedule
+    :param bound: A proven upper bound of the objective, where the solver knows one
+    """
+
+    schedule: Schedule
+    bound: float | None = None
 
 
 class OneByOneSolver(Solver):
     """A solver that treats every instance alone, with random numbers that depend on the seed and its row only."""
 
     @abstractmethod
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         """
         :param instance: A batch of one, without padding
+        :param time_limit: Seconds, or None for the solver's own default
         :param rng: The source of randomness
-        :return: The schedule
+        :return: The schedule, and a bound where one is known
         """
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         results = []
         for row, n_tasks in enumerate(instances.task_mask.sum(1).tolist()):
             start = time.perf_counter()
             # A row that is all padding keeps one slot, because no instance has none.
-            schedule = self.solve_one(instances[row].trim(max(n_tasks, 1)), np.random.default_rng([seed, row]))
-            results.append(SolverResult(schedule, time.perf_counter() - start))
+            solution = self.solve_one(instances[row].trim(max(n_tasks, 1)), time_limit, np.random.default_rng([seed, row]))
+            results.append(SolverResult(solution.schedule, time.perf_counter() - start, bound=solution.bound))
         return results
 
 

@@ -90,7 +90,7 @@ class DLDRL(Solver):
     def check(self, instances: Instances) -> None:
         self.allocator.check_fleet(instances)
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         self.check(instances)
         self.allocator.set_training_mode(False)
         n_samples = SAMPLE_BLOCK if self.decode == "sampling" else 1

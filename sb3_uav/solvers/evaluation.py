@@ -138,7 +138,7 @@ def _evaluate_solver(
     :param log: Where to write
     :return: What the solver achieved
     """
-    results = solver.solve(instances, seed)
+    results = solver.solve(instances, seed=seed)
     objectives, violations = [], []
     for row, (n_tasks, result) in enumerate(zip(instances.task_mask.sum(1).tolist(), results, strict=True)):
         report: ScheduleReport | None = None

@@ -9,7 +9,7 @@ from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import nearest_feasible
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.solvers.base import OneByOneSolver
+from sb3_uav.solvers.base import OneByOneSolver, Solution
 
 MAX_LLOYD_ITERATIONS = 100
 
@@ -29,8 +29,8 @@ class RandomNearest(OneByOneSolver):
 
     name = "random-nearest"
 
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
-        return nearest_feasible_schedule(instance, rng.integers(instance.n_uavs, size=instance.n_tasks))
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        return Solution(nearest_feasible_schedule(instance, rng.integers(instance.n_uavs, size=instance.n_tasks)))
 
 
 class KMeansNearest(OneByOneSolver):
@@ -48,9 +48,9 @@ class KMeansNearest(OneByOneSolver):
             raise ValueError(f"restarts of kmeans-nearest is {restarts}; K-means needs at least 1 start.")
         self.restarts = restarts
 
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
-        return nearest_feasible_schedule(instance, clusters)
+        return Solution(nearest_feasible_schedule(instance, clusters))
 
 
 def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restarts: int = 10) -> np.ndarray:
