@@ -28,6 +28,7 @@ class RandomNearest(OneByOneSolver):
     """Every task goes to a random UAV, every UAV to its nearest feasible task."""
 
     name = "random-nearest"
+    uses_time_limit = False
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         return Solution(nearest_feasible_schedule(instance, rng.integers(instance.n_uavs, size=instance.n_tasks)))
@@ -42,6 +43,7 @@ class KMeansNearest(OneByOneSolver):
     """
 
     name = "kmeans-nearest"
+    uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
         if restarts < 1:
