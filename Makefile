@@ -6,7 +6,7 @@ PYTEST_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-LINT_PATHS := sb3_uav tests benchmarks
+LINT_PATHS := sb3_uav tests benchmarks examples
 BENCHMARKS := $(filter-out benchmarks/_%,$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
@@ -52,7 +52,7 @@ bench: $(INSTALLED)  ## Run every benchmark
 
 clean:  ## Remove caches, builds and the demo's files (not .venv, not logs)
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find sb3_uav tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find $(LINT_PATHS) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## Show this list
 	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

@@ -321,7 +321,7 @@ def test_subset_context_is_the_running_maximum():
     observation = env.reset()
     for step in range(7):
         observed = policy.features_extractor.observed_state(
-            cache, {key: th.as_tensor(value) for key, value in observation.items()}
+            cache, {key: th.as_tensor(value)[:, None] for key, value in observation.items()}
         )
         assert th.equal(observed.context[:, 0], state.context[:, step])
         observation, *_ = env.step(actions[:, 0, step].numpy())

@@ -16,6 +16,9 @@ from sb3_uav.envs.instances import InstanceGenerator, Instances
 
 StateT = TypeVar("StateT", bound="State")
 
+# What an observation keeps throughout an episode.
+STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
+
 
 class State(Protocol):
     """What every state holds: tensors with leading dimensions (batch, n_samples)."""

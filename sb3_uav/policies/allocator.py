@@ -73,14 +73,35 @@ class AllocatorExtractor(EpisodicExtractor):
         return Cache(nodes)
 
     def observed_state(self, cache: Cache, observation: TensorDict) -> AllocatorState:
-        assignment = observation["assignment"]
+        assignment, current_task = observation["assignment"], observation["current_task"].long().squeeze(-1)
+        n_tasks = assignment.shape[-1]
+        final = assignment.gather(1, current_task.argmax(1)[:, None, None].expand(-1, 1, n_tasks))
+        decided = th.arange(n_tasks, device=assignment.device) < current_task[..., None]
+        if assignment.shape[1] > 1 and (assignment == final.where(decided, UNASSIGNED)).all():
+            # Steps of one episode: one running maximum serves them all.
+            context = self.running_context(cache, final)[:, 0]
+            steps = current_task[..., None, None].expand(-1, -1, *context.shape[2:])
+            held = context.gather(1, steps)
+        else:
+            uavs = th.arange(self.n_uavs, device=assignment.device)
+            mine = (assignment[:, :, None] == uavs[:, None])[..., None]
+            # The depot belongs to every UAV and bounds the maximum from below, so it can stand in for other UAVs' tasks.
+            held = th.where(mine, cache.nodes[:, None, None, 1:], cache.nodes[:, None, None, :1]).amax(3)
+        return AllocatorState(held, current_task.clamp(max=n_tasks - 1))
+
+    def running_context(self, cache: Cache, assignment: th.Tensor) -> th.Tensor:
+        """
+        What every UAV holds before and after each step of complete episodes.
+
+        :param cache: Of ``batch`` instances
+        :param assignment: ``(batch, n_samples, n_tasks)``, the UAV of each task or -1
+        :return: ``(batch, n_samples, n_tasks + 1, n_uavs, embed_dim)``
+        """
         uavs = th.arange(self.n_uavs, device=assignment.device)
-        mine = (assignment[:, None] == uavs[:, None])[..., None]
-        # The depot belongs to every UAV and bounds the maximum from below, so it can stand in for other UAVs' tasks.
-        depot = cache.nodes[:, None, :1]
-        context = th.where(mine, cache.nodes[:, None, 1:], depot).amax(2)
-        last_task = cache.nodes.shape[1] - 2
-        return AllocatorState(context[:, None], observation["current_task"].long().clamp(max=last_task))
+        mine = (assignment[..., None] == uavs)[..., None]
+        depot, tasks = cache.nodes[:, None, :1, None], cache.nodes[:, None, 1:, None]
+        first = depot.expand(-1, assignment.shape[1], 1, self.n_uavs, -1)
+        return th.cat([first, th.where(mine, tasks, depot)], dim=2).cummax(dim=2).values
 
     def initial_context(self, cache: Cache, n_samples: int) -> th.Tensor:
         """
@@ -151,13 +172,7 @@ class AllocatorPolicy(EpisodicPolicy):
     def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[AllocatorState, th.Tensor]:
         self.check_fleet(instances)
         batch_size, n_samples, n_tasks = actions.shape
-        uavs = th.arange(self.n_uavs, device=actions.device)
-        mine = (actions[..., None] == uavs)[..., None]
-        depot, tasks = cache.nodes[:, None, :1, None], cache.nodes[:, None, 1:, None]
-        # What the UAV holds before step t is the running maximum over the tasks before t, the depot first.
-        held = th.where(mine, tasks, depot)[:, :, :-1]
-        first = depot.expand(-1, n_samples, 1, self.n_uavs, -1)
-        context = th.cat([first, held], dim=2).cummax(dim=2).values
+        context = self.features_extractor.running_context(cache, actions)[:, :, :-1]
         task = th.arange(n_tasks, device=actions.device).expand(batch_size, n_samples, n_tasks)
         action_mask = th.ones(1, 1, self.n_uavs, dtype=th.bool, device=actions.device)
         return AllocatorState(context.flatten(1, 2), task.flatten(1)), action_mask

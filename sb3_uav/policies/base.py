@@ -16,14 +16,16 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.distributions import MaskableDistribution
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule, TensorDict
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.problem import STATIC_KEYS
 from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
+from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.policies.memory import rows_that_fit
 
 # The settings of the encoder, by preset; arguments of the policy override them one by one.
@@ -32,6 +34,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Section IV-A2 of the paper.
     "paper": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch", use_values=False),
 }
+
+
+# Into how many times as many slots as there are transitions they may be sorted by instance, when some instances have many
+# transitions and others few; beyond, every transition gets a copy of its instance's encoding instead.
+MAX_FILLING = 4
 
 
 class Cache(NamedTuple):
@@ -47,6 +54,13 @@ class Cache(NamedTuple):
 
     def detach(self) -> Cache:
         return Cache(self.nodes.detach(), tuple(projection.detach() for projection in self.projections))
+
+    def rows(self, rows: th.Tensor) -> Cache:
+        """
+        :param rows: ``(n,)`` int64
+        :return: The encodings of these instances, in this order
+        """
+        return Cache(self.nodes[rows], tuple(projection[rows] for projection in self.projections))
 
     def update_rows(self, rows: th.Tensor, fresh: Cache) -> Cache:
         """
@@ -81,6 +95,10 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     has changed: once per episode instead of once per step. Training mode, loading parameters and moving to another device
     clear that cache; so must whoever changes parameters in another way (:meth:`clear_cache`).
 
+    With gradients it encodes every instance of a minibatch once, however many transitions it has there. An episode rollout
+    buffer says which transitions belong together (key ``episode_index``, int64, beside static parts that stand once per
+    episode); with SB3's own buffers it looks for equal rows itself. ``use_cache`` and ``share_encodings`` turn the two off.
+
     :param observation_space: Of one of our environments
     :param features_dim: Size of the features
     :param encoder_kwargs: Arguments of :class:`~sb3_uav.policies.encoder.AttentionEncoder`
@@ -94,6 +112,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         super().__init__(observation_space, features_dim)
         self.encoder = AttentionEncoder(**encoder_kwargs)
         self.use_cache = True
+        self.share_encodings = True
         self.n_encoded_rows = 0
         self._cached: tuple[StaticObservation, Cache] | None = None
 
@@ -125,8 +144,8 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     def observed_state(self, cache: Cache, observation: TensorDict) -> Any:
         """
         :param cache: Of ``batch`` instances
-        :param observation: ``batch`` preprocessed observations
-        :return: The decoder's state with one sample per instance
+        :param observation: The changing part of preprocessed observations, every key ``(batch, n_samples, ...)``
+        :return: The decoder's state
         """
 
     @abstractmethod
@@ -147,11 +166,28 @@ class EpisodicExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: TensorDict) -> th.Tensor:
         """
-        :param observations: ``batch`` preprocessed observations
+        :param observations: ``batch`` preprocessed observations; static keys have a row per episode where there is an
+            ``episode_index``
         :return: ``(batch, features_dim)``
         """
-        cache = self._encode_cached(StaticObservation.from_observation(observations))
-        return self.decode(cache, self.observed_state(cache, observations))[:, 0]
+        static = StaticObservation.from_observation(observations)
+        dynamic = {key: value for key, value in observations.items() if key not in STATIC_KEYS}
+        index = dynamic.pop(EPISODE_INDEX, None)
+        if index is None and th.is_grad_enabled() and self.share_encodings:
+            static, index = static.unique()
+        if index is None:
+            return self._decode_each(self._encode_cached(static), dynamic)
+        grouping = Grouping.by_instance(index, len(static.depot))
+        cache = self.encode(static)
+        if grouping.source.numel() > MAX_FILLING * len(index):
+            return self._decode_each(cache.rows(index), dynamic)
+        state = self.observed_state(cache, {key: grouping.gather(value) for key, value in dynamic.items()})
+        return grouping.scatter(self.decode(cache, state))
+
+    def _decode_each(self, cache: Cache, dynamic: TensorDict) -> th.Tensor:
+        """:return: Features of one transition of every instance, ``(batch, features_dim)``"""
+        state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
+        return self.decode(cache, state)[:, 0]
 
     def _encode_cached(self, static: StaticObservation) -> Cache:
         if self.training or th.is_grad_enabled() or not self.use_cache:
@@ -165,7 +201,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
             if len(rows) == len(changed):
                 cache = self.encode(static)
             elif len(rows) > 0:
-                cache = cache.update_rows(rows, self.encode(StaticObservation(*(field[rows] for field in static))))
+                cache = cache.update_rows(rows, self.encode(static.rows(rows)))
         if rows is None or len(rows) > 0:
             # A copy, because an environment may write its next observation into the same memory.
             self._cached = (StaticObservation(*(field.clone() for field in static)), cache)
@@ -403,7 +439,13 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :return: The masked distribution, and the values ``(batch,)``
         """
         assert isinstance(obs, dict)
-        features = BasePolicy.extract_features(self, obs, self.features_extractor)
+        # The index is no part of the observation space, which preprocessing goes through.
+        observation = {key: value for key, value in obs.items() if key != EPISODE_INDEX}
+        preprocessed = preprocess_obs(observation, self.observation_space, normalize_images=False)
+        assert isinstance(preprocessed, dict)
+        if EPISODE_INDEX in obs:
+            preprocessed[EPISODE_INDEX] = obs[EPISODE_INDEX]
+        features = self.features_extractor(preprocessed)
         logits, values = self._heads(features)
         distribution = self.action_dist.proba_distribution(action_logits=logits)
         distribution.apply_masking(obs["action_mask"].bool() if action_masks is None else action_masks)

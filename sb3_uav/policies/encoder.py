@@ -42,6 +42,23 @@ class StaticObservation(NamedTuple):
             max_distance=observation["max_distance"],
         )
 
+    def rows(self, rows: th.Tensor) -> StaticObservation:
+        """
+        :param rows: ``(n,)`` int64
+        :return: These rows, in this order
+        """
+        return StaticObservation(*(field[rows] for field in self))
+
+    def unique(self) -> tuple[StaticObservation, th.Tensor]:
+        """
+        :return: The different rows, and which of them every row is, ``(batch,)`` int64
+        """
+        flat = th.cat([field.flatten(1).float() for field in self], dim=1)
+        different, index = flat.unique(dim=0, return_inverse=True)
+        # Any row of each kind; index_copy with repeated targets keeps one of them.
+        row = th.arange(len(index), device=index.device)
+        return self.rows(index.new_zeros(len(different)).index_copy(0, index, row)), index
+
     @classmethod
     def from_instances(cls, instances: Instances) -> StaticObservation:
         """:param instances: Instances on the network's device"""

@@ -86,9 +86,9 @@ class RouterExtractor(EpisodicExtractor):
 
     def observed_state(self, cache: Cache, observation: TensorDict) -> RouterState:
         return RouterState(
-            observation["position"].long(),
-            observation["remaining_distance"],
-            observation["action_mask"].bool()[:, None],
+            observation["position"].long().squeeze(-1),
+            observation["remaining_distance"].squeeze(-1),
+            observation["action_mask"].bool(),
         )
 
     def decode(self, cache: Cache, state: RouterState) -> th.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 # Which numbers are drawn. The streams are disjoint, from each other and from generators that were seeded with a plain number.
-TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM, SUBSET_STREAM = range(4)
+TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM, SUBSET_STREAM, FIXED_SET_STREAM, FIXED_SET_ACTION_STREAM = range(6)
 
 
 def random_stream(seed: int, *key: int) -> np.random.Generator:

@@ -1,4 +1,15 @@
+from sb3_uav.training.episode_buffer import EpisodeBufferCallback, EpisodeRolloutBuffer, MaskableEpisodeRolloutBuffer
+from sb3_uav.training.fixed_set import FixedSetEvalCallback
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.its import ITSCallback
+from sb3_uav.training.pretrained_router import PretrainedRouterCallback
 
-__all__ = ["Freezer", "ITSCallback"]
+__all__ = [
+    "EpisodeBufferCallback",
+    "EpisodeRolloutBuffer",
+    "FixedSetEvalCallback",
+    "Freezer",
+    "ITSCallback",
+    "MaskableEpisodeRolloutBuffer",
+    "PretrainedRouterCallback",
+]

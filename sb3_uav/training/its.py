@@ -5,31 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import random
 import re
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    EvalCallback,
-    EventCallback,
-    ProgressBarCallback,
-    tqdm,
-)
-from stable_baselines3.common.logger import HumanOutputFormat, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, ProgressBarCallback, tqdm
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
@@ -41,6 +31,15 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
 from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.training.common import (
+    CallbackT,
+    find_run_folder,
+    hand_over_router,
+    siblings,
+    undisturbed_random_state,
+    write_atomically,
+)
+from sb3_uav.training.episode_buffer import use_episode_buffer
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 
@@ -55,7 +54,11 @@ STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&inte
 
 CHECKPOINT_FOLDER = "its_checkpoint"
 STATE_FILE = "its_state.json"
+# An attribute of the allocator, so that any zip of it knows its last checkpoint: stock rl_zoo3 does not tell callbacks which
+# zip it goes on from.
+CHECKPOINT = "its_checkpoint"
 LOG_FILE = "its_log.csv"
+BEST_ROUTER_FILE = "best_router.zip"
 
 
 @dataclass(frozen=True)
@@ -252,6 +255,8 @@ class ITSCallback(BaseCallback):
             self.save_path = self._find_save_path()
         if not self._started:
             self._make_router()
+            if self.resume_from is None:
+                self.resume_from = self._find_checkpoint()
             if self.resume_from is not None:
                 self._resume(self.resume_from)
             elif self.model._n_updates > 0:
@@ -263,7 +268,8 @@ class ITSCallback(BaseCallback):
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
         self._instances_before = self.epoch * self.instances_per_epoch
         self._steps_before = self.model.num_timesteps
-        self._hand_over_router()
+        assert isinstance(self._router_policy, RouterPolicy)
+        hand_over_router(self, self._router_policy.plan)
         if self.epoch == 0 and len(self.records) < self.n_pretraining_epochs:
             self._router_env.set_generator(WholeInstances(self.problem.generator))
             self._train_router(self.n_pretraining_epochs, "pre-training", first=len(self.records))
@@ -273,6 +279,13 @@ class ITSCallback(BaseCallback):
             limit = self.n_epochs * self.instances_per_epoch
             self.model.max_instances = limit if self._callers_limit is None else min(limit, self._callers_limit)
         self._begin_epoch()
+
+    def _find_checkpoint(self) -> Path | None:
+        """The checkpoint that a loaded allocator belongs to, if it is still where it was written."""
+        noted = getattr(self.model, CHECKPOINT, None)
+        if noted is None or not (Path(noted["folder"]) / STATE_FILE).is_file():
+            return None
+        return Path(noted["folder"])
 
     def _make_router(self) -> None:
         kwargs = dict(self.router_kwargs)
@@ -300,7 +313,7 @@ class ITSCallback(BaseCallback):
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self._router_policy, RouterPolicy):
             raise ValueError(f"router: policy must be a RouterPolicy, found {type(self._router_policy).__name__}.")
-        self._start_router_env()
+        self._prepare_router()
         outputs = [f for f in self.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
         self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
@@ -311,28 +324,15 @@ class ITSCallback(BaseCallback):
         """The router's policy; SB3 declares it an ``ActorCriticPolicy``, which a maskable one is not."""
         return self.router.policy
 
-    def _hand_over_router(self) -> None:
-        assert isinstance(self._router_policy, RouterPolicy)
-        environments = [self.training_env, *(callback.eval_env for callback in self._siblings(EvalCallback))]
-        for env in environments:
-            env.env_method("set_router", self._router_policy.plan)
-
-    def _siblings(self, kind: type[BaseCallback]) -> list[Any]:
-        """The callbacks of this kind in the same training."""
-        return [callback for callback in walk_callbacks(self.locals.get("callback")) if isinstance(callback, kind)]
+    def _siblings(self, kind: type[CallbackT]) -> list[CallbackT]:
+        """The other callbacks of this kind in the same training."""
+        return siblings(self, kind)
 
     def _find_save_path(self) -> Path | None:
-        for callback in self._siblings(EvalCallback):
-            if callback.best_model_save_path is not None:
-                return Path(callback.best_model_save_path)
-        monitor = getattr(self.training_env.unwrapped, "monitor_folder", None)
-        if monitor is not None:
-            return Path(monitor)
-        # Without output files, SB3's logger names a temporary folder, where nobody would look for zips.
-        if any(not isinstance(output, HumanOutputFormat) for output in self.logger.output_formats) and self.logger.dir:
-            return Path(self.logger.dir)
-        warnings.warn("ITSCallback saves no router: set save_path to a folder.", stacklevel=2)
-        return None
+        folder = find_run_folder(self)
+        if folder is None:
+            warnings.warn("ITSCallback saves no router: set save_path to a folder.", stacklevel=3)
+        return folder
 
     # ------------------------------------------------------------------------------------------------------ epochs
 
@@ -528,7 +528,15 @@ class ITSCallback(BaseCallback):
             folder = callback.best_model_save_path
             if folder is not None and callback.best_mean_reward > self._best_mean_reward.get(folder, -np.inf):
                 self._best_mean_reward[folder] = callback.best_mean_reward
-                save_atomically(self.router, Path(folder) / "best_router.zip")
+                self.save_best_router(Path(folder))
+
+    def save_best_router(self, folder: Path) -> None:
+        """
+        Save the router as that of the best allocator so far.
+
+        :param folder: Where that one is saved
+        """
+        save_atomically(self.router, folder / BEST_ROUTER_FILE)
 
     def _save_checkpoint(self) -> None:
         """
@@ -540,6 +548,7 @@ class ITSCallback(BaseCallback):
         if self.save_path is None:
             return
         folder = self.save_path / CHECKPOINT_FOLDER
+        setattr(self.model, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": self.epoch})
         names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self._n_router_epochs()}.zip"}
         save_atomically(self.model, folder / names["allocator"])
         save_atomically(self.router, folder / names["router"])
@@ -551,9 +560,11 @@ class ITSCallback(BaseCallback):
 
     def _resume(self, folder: Path) -> None:
         state = read_state(folder)
-        if isinstance(self.model, REINFORCE) and self.model.epoch != state["epoch"]:
+        noted = getattr(self.model, CHECKPOINT, {"epoch": state["epoch"]})["epoch"]
+        epoch = self.model.epoch if isinstance(self.model, REINFORCE) else noted
+        if epoch != state["epoch"]:
             raise ValueError(
-                f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {self.model.epoch}; "
+                f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {epoch}; "
                 f"train the allocator of {folder / state['allocator']}."
             )
         self.epoch = state["epoch"]
@@ -565,11 +576,16 @@ class ITSCallback(BaseCallback):
             raise ValueError(f"{folder / state['router']}: not an intact router ({error}); use another checkpoint.") from error
         loaded.set_logger(self.router.logger)
         self.router = loaded
-        self._start_router_env()
+        self._prepare_router()
         self._freezers["router"] = Freezer(self.router.policy)
 
-    def _start_router_env(self) -> None:
-        """Reset now what SB3 would reset when the router first learns, which may be in the middle of generated subsets."""
+    def _prepare_router(self) -> None:
+        """Give the router the buffer of whole episodes, and reset its environment."""
+        is_stock_buffer = type(self.router.rollout_buffer) in (DictRolloutBuffer, MaskableDictRolloutBuffer)
+        if is_stock_buffer and not isinstance(self.router, REINFORCE):
+            # A YAML file cannot name a buffer class.
+            use_episode_buffer(self.router)
+        # SB3 would reset it when the router first learns, which may be in the middle of generated subsets.
         self.router._last_obs = self._router_env.reset()  # type: ignore[assignment]
         self.router._last_episode_starts = np.ones(self._router_env.num_envs, dtype=bool)
 
@@ -612,41 +628,3 @@ def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
     if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
         raise ValueError(f"router: algo {name!r} is not an on-policy algorithm of SB3.")
     return algorithm
-
-
-@contextmanager
-def undisturbed_random_state() -> Iterator[None]:
-    """Undo the seeding of the global generators by an algorithm's constructor, in the middle of another one's training."""
-    states = random.getstate(), np.random.get_state()
-    with th.random.fork_rng():
-        yield
-    random.setstate(states[0])
-    np.random.set_state(states[1])
-
-
-def walk_callbacks(callback: Any) -> Iterator[BaseCallback]:
-    """
-    :param callback: A callback or None
-    :return: It and all callbacks inside it
-    """
-    if isinstance(callback, CallbackList):
-        for child in callback.callbacks:
-            yield from walk_callbacks(child)
-    elif isinstance(callback, BaseCallback):
-        yield callback
-        if isinstance(callback, EventCallback):
-            yield from walk_callbacks(callback.callback)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """
-    :param path: The file to write; its folder is made if need be
-    :param text: What to write
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_text(text)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ FORWARDED = {
     "evaluate": ("sb3_uav.zoo.evaluate", "evaluate zips and solvers on the same instances"),
     "anytime": ("sb3_uav.zoo.anytime", "draw what an evaluation found against the time it took"),
     "reproduce": ("sb3_uav.reproduce.command", "make the tables and figures of the paper anew"),
+    "compare": ("sb3_uav.zoo.compare", "train algorithms at an equal budget and compare them"),
     "demo": ("sb3_uav.zoo.demo", "train and evaluate a small scenario in a few minutes"),
 }
 

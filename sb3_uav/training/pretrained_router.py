@@ -1,0 +1,59 @@
+"""A router that was trained before, for training an allocator without ITS."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_uav.envs.allocation import AllocationProblem
+from sb3_uav.policies import RouterPolicy
+from sb3_uav.policies.loading import load_policy
+from sb3_uav.training.common import find_run_folder, hand_over_router, siblings, undisturbed_random_state, write_atomically
+from sb3_uav.training.fixed_set import evaluated_problem
+from sb3_uav.training.its import ITSCallback
+
+ROUTER_FILE = "router.zip"
+
+
+class PretrainedRouterCallback(BaseCallback):
+    """
+    Lets the rewards of the allocator's training come from a router that does not learn.
+
+    It is handed to the training environment and to that of SB3's ``EvalCallback``, and copied into the run folder, where
+    ``sb3_uav.zoo.enjoy`` finds it. Without this callback or ``ITSCallback``, the UAVs fly to the nearest task. In the YAML of
+    a zoo::
+
+        callback:
+          - sb3_uav.training.PretrainedRouterCallback: {router: router.zip}
+
+    :param router: Zip of any SB3 algorithm with a ``RouterPolicy``
+    :param save_path: Folder of the copy; the run folder when None
+    :param verbose: Verbosity level: 0 for no output
+    :raises FileNotFoundError: If there is no such zip
+    """
+
+    def __init__(
+        self, router: str | os.PathLike[str], save_path: str | os.PathLike[str] | None = None, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        self.router = Path(router)
+        if not self.router.is_file():
+            raise FileNotFoundError(f"router: {router}: no such file; give the zip of a router that was trained before.")
+        self.save_path = None if save_path is None else Path(save_path)
+
+    def _on_training_start(self) -> None:
+        if siblings(self, ITSCallback):
+            raise ValueError("PretrainedRouterCallback and ITSCallback both bring a router; use one of them.")
+        if not isinstance(evaluated_problem(self.training_env), AllocationProblem):
+            raise ValueError(f"PretrainedRouterCallback needs a TaskAllocation environment, found {self.training_env}.")
+        with undisturbed_random_state():
+            router = load_policy(self.router, self.model.device, RouterPolicy)
+        hand_over_router(self, router.plan)
+        folder = self.save_path or find_run_folder(self)
+        if folder is not None:
+            write_atomically(folder / ROUTER_FILE, self.router.read_bytes())
+
+    def _on_step(self) -> bool:
+        return True
