@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import sys
-import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
@@ -18,7 +18,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
-from sb3_uav.solvers import Solver, SolverResult, limits, make_solver, ortools_routing, pyvrp_search
+from sb3_uav.solvers import Solver, SolverResult, limits, make_solver, milp, ortools_routing, pyvrp_search
 from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
 from sb3_uav.solvers.programs import FREE_LICENCE_SIZE, Answer, Backend
 from sb3_uav.solvers.pyvrp_search import polish_schedule
@@ -35,7 +35,7 @@ ALL = (*RELIABLE, "ortools-gls:time_limit=0.02")
 
 
 class Ticks:
-    """A clock on which every look at it takes a millisecond, so that no test depends on how busy the machine is."""
+    """A clock on which every look at it takes a millisecond."""
 
     def __init__(self) -> None:
         self.looks = 0
@@ -45,12 +45,14 @@ class Ticks:
         return self.looks / 1000
 
 
-@pytest.fixture
-def ticks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PyVRP looks once per iteration: its time limits become numbers of iterations, 1000 a second."""
+@pytest.fixture(scope="module", autouse=True)
+def ticks() -> Iterator[None]:
+    """PyVRP looks once per iteration, so that it makes 1000 of them a second however busy the machine is."""
     clock = Ticks()
-    monkeypatch.setattr(limits, "time", clock)
-    monkeypatch.setattr(pyvrp_search, "time", clock)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (limits, milp, ortools_routing, pyvrp_search):
+            patch.setattr(module, "time", clock)
+        yield
 
 
 def solved(spec: str | Solver, instances: Instances, row: int = 0) -> tuple[float, SolverResult]:
@@ -229,7 +231,6 @@ def test_greedy_insertion_takes_the_best_rate_first() -> None:
 
 
 @needs_pyvrp
-@pytest.mark.usefixtures("ticks")
 def test_stronger_solvers_are_stronger() -> None:
     """On the paper's distribution, local search gains on insertion, and PyVRP on OR-Tools' local optimum."""
     batch = UniformGenerator(60, n_uavs=3)(5, np.random.default_rng(2))
@@ -244,7 +245,7 @@ def test_search_parameters_of_ortools() -> None:
     """The paper's variant has no limit at all; guided local search gets what is left of its time, and at least something."""
     pywrapcp = pytest.importorskip("ortools.constraint_solver.pywrapcp")
     enums = pytest.importorskip("ortools.constraint_solver.routing_enums_pb2")
-    now = time.perf_counter()
+    now = ortools_routing.time.perf_counter()
     plain, early, late = (ortools_routing._search_parameters(pywrapcp, end) for end in (None, now + 1e6, now - 1.0))
     for parameters in (plain, early, late):
         assert parameters.first_solution_strategy == enums.FirstSolutionStrategy.PATH_CHEAPEST_ARC
@@ -258,7 +259,6 @@ def test_search_parameters_of_ortools() -> None:
 
 
 @needs_pyvrp
-@pytest.mark.usefixtures("ticks")
 @pytest.mark.parametrize("kind", ["powers", "one jackpot", "large fleet", "whole"])
 def test_pyvrp_with_uneven_values(kind: str) -> None:
     """Its penalties can enforce the maximum distance whatever the values are."""
@@ -276,7 +276,6 @@ def test_pyvrp_with_uneven_values(kind: str) -> None:
 
 
 @needs_pyvrp
-@pytest.mark.usefixtures("ticks")
 @pytest.mark.parametrize("seed", range(3))
 def test_polish_starts_from_the_schedule(seed: int) -> None:
     """In no time at all it returns what it was given; with some, it gains on it."""
@@ -299,7 +298,6 @@ def test_polish_is_never_worse(instance: Instances, seed: int) -> None:
 
 
 @needs_pyvrp
-@pytest.mark.usefixtures("ticks")
 def test_the_seed_reaches_pyvrp() -> None:
     """The same seed and number of iterations give the same schedule."""
     instance = UniformGenerator(100, n_uavs=3)(1, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Local search, ruin and recreate, and K-means+VND: feasible, repeatable, never worse, at a local optimum where they say so."""
+"""Local search, ruin and recreate, K-means+VND: feasible, repeatable, never worse, at a local optimum where they say so."""
 
 from __future__ import annotations
 

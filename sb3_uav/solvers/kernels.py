@@ -30,9 +30,9 @@ NOWHERE = 1e300
 MAX_SEGMENT = 3
 
 
-# What is known of a node: where it is and what it is worth; by whom it is visited, -1 if by none, and as which stop; whether it
-# waits in the queue; and, as a candidate for insertion, the trial that saw it last, the factor on its worth (below 0 to leave
-# it out), what its cheapest insertion adds to which tour, and after which node.
+# What is known of a node: where it is and what it is worth; by whom it is visited, -1 if by none, and as which stop; whether
+# it waits in the queue; and, as a candidate for insertion, the trial that saw it last, the factor on its worth (below 0 to
+# leave it out), what its cheapest insertion adds to which tour, and after which node.
 NODE = np.dtype(
     [
         ("x", np.float64),
@@ -98,7 +98,7 @@ class Plan(NamedTuple):
 
     :param nodes: ``(n_tasks + 1,)`` of :data:`NODE`, the depot first
     :param near: ``(n_tasks + 1, n_near)`` int32, for every node the nearest tasks, nearest first
-    :param routes: ``(2 * n_uavs, n_tasks + 2)`` int64: of every UAV the depot, its tasks in flying order, the depot; then copies
+    :param routes: ``(2 * n_uavs, n_tasks + 2)`` int64: of every UAV the depot, its tasks in flying order, the depot; copies
     :param tours: ``(n_uavs,)`` of :data:`TOUR`
     :param lists: ``(4, n_tasks + n_uavs + 1)`` int64, lists of nodes or tours
     :param state: ``(1,)`` of :data:`STATE`
@@ -261,7 +261,7 @@ def find_near(nodes, near):
 @njit(cache=True, nogil=True)
 def move_segment(plan, v, first, count, w, place, flip):
     """
-    Move up to three neighbouring tasks of tour ``v`` to ``place`` of tour ``w`` (as numbered before), turned round if ``flip``.
+    Move up to three neighbouring tasks of tour ``v`` to ``place`` of tour ``w`` (as numbered before), turned if ``flip``.
     """
     route = plan.routes[v]
     a, b, c = route[first], route[first + 1], route[min(first + 2, plan.tours[v].size + 1)]
@@ -276,8 +276,8 @@ def move_segment(plan, v, first, count, w, place, flip):
 @njit(cache=True, nogil=True)
 def survey_segments(plan, a, saved):
     """
-    :param saved: ``(2 * MAX_SEGMENT,)`` float64, to be filled with what is saved by taking out the tasks from ``a`` forwards, one
-        to three, and backwards; 0 where a tour ends before
+    :param saved: ``(2 * MAX_SEGMENT,)`` float64, to be filled with what is saved by taking out the tasks from ``a`` forwards,
+        one to three, and backwards; 0 where a tour ends before
     :return: The largest
     """
     v, p = plan.nodes[a].owner, plan.nodes[a].position
@@ -685,7 +685,7 @@ def fill_everywhere(plan):
 
 
 @njit(cache=True, nogil=True)
-def replace(plan):
+def replace(plan):  # noqa: C901 (compiled: every call of a helper would pass the whole state)
     """Swap visited tasks for unvisited ones that are worth more, or as much on a shorter tour; returns how often."""
     count = 0
     leg, saved, reach = np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1)

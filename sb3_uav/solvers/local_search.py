@@ -148,8 +148,8 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
     Local search until nothing changes.
 
     Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
-    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of tasks
-    out to fill the gap better. Deterministic, and a second repair changes nothing.
+    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of
+    tasks out to fill the gap better. Deterministic, and a second repair changes nothing.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it
@@ -194,12 +194,12 @@ def improve(instance: Instances, schedule: Schedule, seconds: float | None = Non
     """
     Ruin and recreate, for as long as one likes.
 
-    Strings of neighbouring tasks are taken out of one to three tours and the gaps filled again, with worse schedules accepted as
-    in simulated annealing; then the best is repaired. Value comes first, then length.
+    Strings of neighbouring tasks are taken out of one to three tours and the gaps filled again, with worse schedules accepted
+    as in simulated annealing; then the best is repaired. Value comes first, then length.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it; an empty one will do
-    :param seconds: Wall time, exceeded only by the last repair; if None, a number of trials proportional to the number of tasks
+    :param seconds: Wall time, exceeded only by the last repair; if None, trials in proportion to the number of tasks
     :param seed: Of the random numbers; without ``seconds`` the same seed gives the same schedule
     :return: A feasible schedule that is not worse: of the same value it is not longer
     :raises InfeasibleScheduleError: If the schedule breaks a constraint
