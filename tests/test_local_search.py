@@ -223,14 +223,16 @@ def test_improvement_finds_the_optimum(valued: bool) -> None:
 
 @pytest.mark.parametrize("valued", [False, True])
 def test_improvement_beats_repair(valued: bool) -> None:
-    gains = []
+    gains, seed_matters = [], []
     for seed in range(4):
         instance = medium(100, 4, seed, valued)
         repaired = repair(instance, Schedule([]))
         improved = improve(instance, repaired, seed=seed)
         gains.append(rank(instance, improved)[0] / rank(instance, repaired)[0])
-        assert improved != improve(instance, repaired, seed=seed + 100)
+        seed_matters.append(improved != improve(instance, repaired, seed=seed + 100))
     assert np.mean(gains) > 1.01
+    # Not everywhere: two seeds may find the same best schedule.
+    assert any(seed_matters)
 
 
 def test_improvement_in_time() -> None:

@@ -136,7 +136,8 @@ class LocalSearch:
         """
         n_trials = 10
         now = time.perf_counter()
-        while (progress := (now - start) / seconds) < 1.0:
+        while now < start + seconds:
+            progress = (now - start) / seconds
             chunk = min(CHUNK_SECONDS, start + seconds - now)
             kernels.anneal(plan, best, n_trials, progress, min(progress + chunk / seconds, 1.0), settings)
             then, now = now, time.perf_counter()
