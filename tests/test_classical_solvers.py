@@ -46,13 +46,13 @@ class Ticks:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def ticks() -> Iterator[None]:
+def ticks() -> Iterator[Ticks]:
     """PyVRP looks once per iteration, so that it makes 1000 of them a second however busy the machine is."""
     clock = Ticks()
     with pytest.MonkeyPatch.context() as patch:
         for module in (limits, milp, ortools_routing, pyvrp_search):
             patch.setattr(module, "time", clock)
-        yield
+        yield clock
 
 
 def solved(spec: str | Solver, instances: Instances, row: int = 0) -> tuple[float, SolverResult]:
@@ -276,6 +276,26 @@ def test_pyvrp_with_uneven_values(kind: str) -> None:
 
 
 @needs_pyvrp
+def test_pyvrp_without_a_feasible_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tours that are too long are left out, where penalties are too low to avoid them."""
+    monkeypatch.setattr(pyvrp_search, "PENALTY_PER_PRIZE", 1)
+    generator = np.random.default_rng(3)
+    for n_uavs in (1, 2, 3):
+        values = 10.0 ** generator.uniform(-6, 6, 80)
+        instance = UniformGenerator(80)(1, generator)
+        instance = Instances.from_arrays(instance.depot, instance.tasks, values[None], 1.0, n_uavs)
+        objective("pyvrp:time_limit=0.1", instance)
+
+
+@needs_pyvrp
+def test_pyvrp_ends_when_all_is_visited(ticks: Ticks) -> None:
+    instance = UniformGenerator(10, n_uavs=2, max_distance=9.0)(1, np.random.default_rng(0))
+    before = ticks.looks
+    assert objective("pyvrp:time_limit=10", instance) == 10
+    assert ticks.looks - before < 100
+
+
+@needs_pyvrp
 @pytest.mark.parametrize("seed", range(3))
 def test_polish_starts_from_the_schedule(seed: int) -> None:
     """In no time at all it returns what it was given; with some, it gains on it."""
@@ -447,6 +467,20 @@ def test_integer_tours_are_feasible(instance: Instances, data: st.DataObject) ->
         schedule = reduced.schedule([route])
         check_schedule(instance, 0, schedule)
         assert reduced.routes(schedule) == [list(route)]
+
+
+@settings(max_examples=30)
+@given(seeds, st.integers(2, 12))
+def test_tours_that_are_just_too_long(seed: int, n_tasks: int) -> None:
+    """Rounding never makes an infeasible tour feasible, nor much that is feasible infeasible."""
+    points = np.random.default_rng(seed).random((n_tasks + 1, 2))
+    stops = [*range(n_tasks + 1), 0]
+    length = sum(math.dist(points[a], points[b]) for a, b in pairwise(stops))
+    for factor, feasible in ((1 - 1e-8, False), (1 + 1e-5, True)):
+        distances = ReducedInstance.of(
+            Instances.from_arrays(points[0], points[1:], None, length * factor, 1)
+        ).integer_distances()
+        assert (sum(int(distances[a, b]) for a, b in pairwise(stops)) <= RESOLUTION) == feasible
 
 
 # --------------------------------------------------------------------------------------------------------- what is not there
