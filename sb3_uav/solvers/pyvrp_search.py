@@ -70,7 +70,7 @@ def polish_schedule(
     :raises ValueError: If the time limit is not a finite number above 0
     """
     found = _search(instance, schedule, deadline_after(time_limit, "polish_schedule"), seed, num_neighbours)
-    return max(schedule, found, key=lambda candidate: _total_value(instance, candidate))
+    return max(found, schedule, key=lambda candidate: _total_value(instance, candidate))
 
 
 def _require_pyvrp(solver: str) -> Any:
