@@ -6,7 +6,7 @@ PYTEST_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-LINT_PATHS := sb3_uav tests benchmarks
+LINT_PATHS := sb3_uav tests benchmarks examples
 BENCHMARKS := $(filter-out benchmarks/_%,$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
@@ -25,11 +25,12 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)
 	$(BIN)/python -m sb3_uav.zoo.demo --out demo
 
+# One process per core, and one thread in each: threads that wait for a busy core cost more than they bring.
 test: $(INSTALLED)  ## Run the whole test suite
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(PYTEST_ARGS)
 
 test-fast: $(INSTALLED)  ## Run the tests without the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow" $(PYTEST_ARGS)
 
 lint: $(INSTALLED)  ## Look for mistakes with ruff
 	$(BIN)/ruff check $(LINT_PATHS)
@@ -52,7 +53,7 @@ bench: $(INSTALLED)  ## Run every benchmark
 
 clean:  ## Remove caches, builds and the demo's files (not .venv, not logs)
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find sb3_uav tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find $(LINT_PATHS) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## Show this list
 	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "  %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

@@ -13,6 +13,7 @@ from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional
 
 from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
@@ -166,6 +167,15 @@ def test_first_full_batch_epoch_has_ratio_one(level, algorithm):
     assert model.logger.name_to_value["train/clip_fraction"] == 0.0
 
 
+def test_a_wrapper_that_changes_the_static_part_at_every_step_is_stored_as_it_is():
+    """VecNormalize's statistics move on within an episode."""
+    model = make_model("router", n_epochs=1, rollout_buffer_class=EpisodeRolloutBuffer)
+    model.env = VecNormalize(model.env, norm_obs_keys=["tasks", "depot"])
+    model.learn(N_STEPS * N_ENVS)
+    assert model.logger.name_to_value["train/approx_kl"] == pytest.approx(0.0, abs=1e-7)
+    assert model.rollout_buffer._n_fragments > N_ENVS * N_STEPS // 2
+
+
 # ------------------------------------------------------------------------------------------ storing and encoding once
 
 
@@ -228,6 +238,28 @@ def test_memory_per_step_is_that_of_the_changing_part():
 
     per_task = (bytes_per_step(40) - bytes_per_step(20)) / 20
     assert per_task == np.dtype(np.float32).itemsize, "only the assignment may grow with the number of tasks"
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_an_instance_with_most_of_the_steps_does_not_fill_the_table_with_copies(level):
+    """The other way to decode computes the same, instances encoded once all the same."""
+    model, ours = collect_twice(level)
+    flat(ours)
+    lengths = np.diff(ours._starts)
+    one_step_each = ours._starts[:-1]
+    longest = int(lengths.argmax())
+    indices = np.union1d(one_step_each, np.arange(*ours._starts[longest : longest + 2]))
+    observations = ours._get_samples(indices).observations
+    grouping = Grouping.by_instance(observations[EPISODE_INDEX], len(lengths))
+    results = []
+    for limit in (grouping.source.numel() / len(indices) / 2, grouping.source.numel()):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sb3_uav.policies.base.MAX_FILLING", limit)
+            model.policy.features_extractor.n_encoded_rows = 0
+            results.append(model.policy.evaluate_actions(observations, th.zeros(len(indices))))
+            assert model.policy.features_extractor.n_encoded_rows == len(lengths)
+    for copied, grouped in zip(*results, strict=True):
+        th.testing.assert_close(copied, grouped, atol=1e-5, rtol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------ minibatches

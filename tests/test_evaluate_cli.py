@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import subprocess
 import sys
 import types
@@ -22,8 +21,8 @@ from sb3_uav.envs import BatchedVecEnv, Instances, Schedule, UniformGenerator, c
 from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.solvers import DLDRL, SOLVERS, Solver, SolverResult, evaluate, make_solver, print_table
-from sb3_uav.solvers.evaluation import RESULT_COLUMNS
+from sb3_uav.solvers import SOLVERS, Solver, SolverResult
+from sb3_uav.solvers.results import RESULT_COLUMNS, file_hash
 from sb3_uav.zoo import cli
 
 TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
@@ -61,8 +60,13 @@ def run(*arguments: Any) -> int:
 def read_results(folder: Path) -> list[dict[str, str]]:
     with (folder / "results.csv").open(newline="") as file:
         reader = csv.DictReader(file)
-        assert reader.fieldnames == ["solver", "instance", "n_uavs", "n_tasks", "objective", "length", "seconds", "feasible"]
+        assert tuple(reader.fieldnames or ()) == RESULT_COLUMNS
         return list(reader)
+
+
+def read_summary(folder: Path) -> list[dict[str, str]]:
+    with (folder / "summary.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def read_schedules(folder: Path) -> list[dict[str, Any]]:
@@ -87,13 +91,23 @@ class Stub(Solver):
     def __init__(self, routes: Sequence[Sequence[int]] = ()) -> None:
         self.routes = routes
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         return [SolverResult(Schedule(self.routes), 0.5, len(instances)) for _ in range(len(instances))]
 
 
 class Interrupted(Stub):
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         raise KeyboardInterrupt
+
+
+class Timed(Stub):
+    """Visits a task only if it has more than a second, and refuses to work without any time."""
+
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
+        if time_limit is None or time_limit == 0:
+            raise ValueError("Give timed a time limit above 0.")
+        tasks = [[int(reachable.nonzero()[0, 0])] if time_limit > 1 else [] for reachable in instances.reachable()]
+        return [SolverResult(Schedule([route]), time_limit) for route in tasks]
 
 
 class OutOfRange(Stub):
@@ -113,7 +127,8 @@ def test_files_and_table(decode: str, title: str, inputs: Inputs, tmp_path: Path
     )  # fmt: skip
     assert code == 0
     out = tmp_path / "new" / "out"
-    assert sorted(path.name for path in out.iterdir()) == ["results.csv", "schedules.jsonl"]
+    files_written = ["evaluation.json", "results.csv", "schedules.jsonl", "summary.csv", "summary.json"]
+    assert sorted(path.name for path in out.iterdir()) == files_written
     solvers = [f"DL-DRL ({title})", f"DL-DRL untrained ({title})", "kmeans-nearest", "random-nearest"]
     rows, lines = read_results(out), read_schedules(out)
     expected = [(solver, str(i)) for part in (range(4), range(4, 6)) for solver in solvers for i in part]
@@ -122,7 +137,7 @@ def test_files_and_table(decode: str, title: str, inputs: Inputs, tmp_path: Path
 
     files = [Instances.load(inputs.small), Instances.load(inputs.large)]
     for row, line in zip(rows, lines, strict=True):
-        assert sorted(line) == ["instance", "lengths", "objective", "routes", "solver"]
+        assert sorted(line) == ["instance", "lengths", "objective", "routes", "seed", "solver", "time_limit"]
         _, index, schedule = schedule_from_json(line, "schedules.jsonl")
         instances, index = (files[0], index) if index < 4 else (files[1], index - 4)
         report = check_schedule(instances, index, schedule)
@@ -133,16 +148,23 @@ def test_files_and_table(decode: str, title: str, inputs: Inputs, tmp_path: Path
         assert row["feasible"] == "True" and float(row["seconds"]) > 0
 
     table = capsys.readouterr().out
+    summary = {row["solver"]: row for row in read_summary(out) if row["source"] == "U3-N20"}
+    best = max(float(row["objective"]) for row in summary.values())
+    reference = np.array([float(row["objective"]) for row in rows if row["solver"] == solvers[0]][:4])
     for solver in solvers:
-        values = [float(row["objective"]) for row in rows if row["solver"] == solver and row["n_tasks"] == "20"]
-        cells = next(line for line in table.splitlines() if solver in line).split("│")
-        error = np.std(values, ddof=1) / 2
-        batch = "4" if solver.startswith("DL-DRL") else "1"
-        found = [cell.strip() for cell in cells[1:-1]]
-        assert found[:3] == [solver, f"{np.mean(values):.2f}", f"{error:.2f}"]
-        assert found[4:] == [batch, "0"]
+        values = np.array([float(row["objective"]) for row in rows if row["solver"] == solver and row["n_tasks"] == "20"])
+        printed = next(text for text in table.splitlines() if f" {solver} " in text).split()
+        error, gap = values.std(ddof=1) / 2, 100 * (best - values.mean()) / best
+        differences = values - reference
+        # Student's t for 3 degrees of freedom.
+        halfwidth = 3.182 * differences.std(ddof=1) / 2
+        told = "reference" if solver == solvers[0] else f"{differences.mean():+.2f} ± {halfwidth:.2f}"
+        start = f"{solver} {values.mean():.2f} {error:.2f} {gap:.2f} {told} "
+        assert " ".join(printed).startswith(start)
+        assert printed[-1] == ("4" if solver.startswith("DL-DRL") else "1")
+        assert float(summary[solver]["difference"]) == pytest.approx(differences.mean())
+        assert float(summary[solver]["difference_high"]) == pytest.approx(differences.mean() + halfwidth)
     assert table.index("U3-N20: 4 instances") < table.index("U3-N60: 2 instances")
-    assert all(len(line.rstrip()) <= 80 for line in table.splitlines())
 
 
 def test_seed_and_batch_size(inputs: Inputs, tmp_path: Path) -> None:
@@ -158,67 +180,145 @@ def test_seed_and_batch_size(inputs: Inputs, tmp_path: Path) -> None:
     assert schedules("c", "--seed", 4) != first
 
 
-def test_means_errors_and_times_in_python(tmp_path: Path) -> None:
-    """Values count, not visits; a single instance has no standard error."""
-    instances = Instances.from_arrays(
-        np.zeros((3, 2)), np.full((3, 2, 2), 0.1), values=[[1.0, 5.0], [2.0, 5.0], [6.0, 5.0]], n_uavs=2
-    )
-    (row,) = evaluate([Stub([[0]])], instances, tmp_path)
-    assert row.objective == 3.0 and row.standard_error == pytest.approx(math.sqrt(7) / math.sqrt(3))
-    assert (row.n_instances, row.seconds, row.batch_size, row.violations) == (3, 0.5, 3, ())
-    (row,) = evaluate([Stub([[0]])], instances[:1], tmp_path)
-    assert row.objective == 1.0 and math.isnan(row.standard_error)
-
-
-def test_infeasible_schedules_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A task visited twice, and a tour that is too long: said so, not counted, and the others are kept."""
-    instances = Instances.from_arrays([[0.0, 0.0]] * 2, [[[0.1, 0.0], [0.2, 0.0]], [[0.1, 0.0], [3.0, 0.0]]], n_uavs=2)
-    lines: list[str] = []
-    far, twice = Stub([[0, 1]]), Stub([[0, 1], [1]])
-    far.name, twice.name = "far", "twice"
-    summary = evaluate([far, twice], {"set": instances}, tmp_path, progress=lines.append)
-    assert lines == ["far on set: 2 instances", "twice on set: 2 instances"]
-    assert summary[0].objective == 2.0 and summary[0].violations == (
-        "far, instance 1 of set: UAV 0 flies 6.000000000, which is 4 over its maximum of 2.000000000.",
-    )
-    assert math.isnan(summary[1].objective) and len(summary[1].violations) == 2
-    assert "Task 1 is visited twice, by UAV 0 and UAV 1" in summary[1].violations[0]
-    rows, schedules = read_results(tmp_path), read_schedules(tmp_path)
-    assert [row["feasible"] for row in rows] == ["True", "False", "False", "False"]
-    assert [row["objective"] for row in rows] == ["2.0", "", "", ""] and rows[1]["length"] == ""
-    assert schedules[1] == {"solver": "far", "instance": 1, "routes": [[0, 1]], "objective": None, "lengths": []}
-    print_table(summary)
-    last = capsys.readouterr().out.splitlines()[-2].split("│")
-    assert [cell.strip() for cell in last[2:4]] == ["-", "-"] and last[6].strip() == "2"
-
-
 def test_infeasible_schedules_set_the_exit_code(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:OutOfRange")
     assert run("--solvers", "broken", "random-nearest", "--instances", inputs.small, "--out", tmp_path) == 1
-    assert "infeasible schedule: broken, instance 0 of U3-N20: UAV 1 visits task 99" in capsys.readouterr().err
+    assert "sb3-uav: wrong: broken, instance 0 of U3-N20: UAV 1 visits task 99" in capsys.readouterr().err
     assert [row["feasible"] for row in read_results(tmp_path)] == ["False"] * 4 + ["True"] * 4
 
 
-@pytest.mark.parametrize("failure", ["interrupted", "error"])
-def test_nothing_is_half_written(
-    failure: str, inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_pairs_side_by_side(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Zips are solvers like others; the options of the pair and those of a spec give the same schedules."""
+    zips = f"allocator={inputs.allocator},router={inputs.router}"
+    code = run(
+        *inputs.pair, "--decode", "sampling", "--samples", 2, "--instances", inputs.small, "--out", tmp_path,
+        "--reference", "K-means+AM", "--solvers", f"dl-drl:{zips},decode=sampling,samples=2", f"dl-drl-i:{zips},name=DL-DRL-I",
+        f"kmeans-am:router={inputs.router},name=K-means+AM",
+    )  # fmt: skip
+    assert code == 0
+    lines = read_schedules(tmp_path)
+    names = ["DL-DRL (sampling 2)", f"dl-drl:{zips},decode=sampling,samples=2", "DL-DRL-I", "K-means+AM"]
+    assert [line["solver"] for line in lines] == [name for name in names for _ in range(4)]
+    routes = {name: [line["routes"] for line in lines if line["solver"] == name] for name in names}
+    assert routes[names[0]] == routes[names[1]] != routes[names[2]]
+    assert [(row["solver"], row["reference"]) for row in read_summary(tmp_path)] == [(name, "K-means+AM") for name in names]
+    assert "Difference: to K-means+AM on the same instances" in capsys.readouterr().out
+    told = json.loads((tmp_path / "evaluation.json").read_text())
+    for name in names[:3]:
+        files = told["solvers"][name]["files"]
+        assert files["allocator"] == {"path": str(inputs.allocator), "sha256": file_hash(inputs.allocator)}
+        assert files["router"] == {"path": str(inputs.router), "sha256": file_hash(inputs.router)}
+
+
+def test_device_and_batch_size_are_for_all_networks(inputs: Inputs, tmp_path: Path) -> None:
+    zips = f"allocator={inputs.allocator},router={inputs.router}"
+    common = ("--instances", inputs.small, "--out", tmp_path, "--batch-size", 3, "--device", "cpu", "--solvers")
+    assert run(*common, f"kmeans-am:router={inputs.router}", f"dl-drl:{zips},batch_size=2", "random-nearest") == 0
+    assert [row["batch_size"] for row in read_results(tmp_path)] == ["3"] * 3 + ["1"] + ["2"] * 4 + ["1"] * 4
+
+
+# ------------------------------------------------------------------------------------------- interruptions and other troubles
+
+
+def test_going_on_after_ctrl_c(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ctrl-C or an error in the second solver: the files of the evaluation before are still there, and nothing else."""
-    arguments = ("--instances", inputs.small, "--out", tmp_path, "--solvers", "random-nearest")
-    assert run(*arguments) == 0
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    if failure == "interrupted":
-        monkeypatch.setitem(SOLVERS, "failing", f"{__name__}:Interrupted")
-        assert run(*arguments, "failing") == 130
-        assert "interrupted" in capsys.readouterr().err
-    else:
-        monkeypatch.setattr(DLDRL, "check", lambda *_: None)
-        UniformGenerator(5, n_uavs=2)(1, np.random.default_rng(0)).save(tmp_path.parent / "U2.npz")
-        files = (inputs.small, tmp_path.parent / "U2.npz")
-        assert "trained for 3 UAVs" in user_error(capsys, *inputs.pair, "--instances", *files, "--out", tmp_path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    """What was found stays; the same call goes on from there, and --overwrite starts anew."""
+    common = ("--instances", inputs.small, "--out", tmp_path, "--solvers", "random-nearest")
+    monkeypatch.setitem(SOLVERS, "halting", f"{__name__}:Interrupted")
+    assert run(*common, "halting") == 130
+    message = capsys.readouterr().err
+    assert f"{tmp_path} holds the results so far; the same command goes on from there" in message
+    assert message.endswith("sb3-uav: interrupted\n")
+    before = (tmp_path / "results.csv").read_text()
+    assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
+
+    monkeypatch.setitem(SOLVERS, "halting", f"{__name__}:Stub")
+    assert run(*common, "halting") == 0
+    assert "random-nearest on U3-N20: 4 instances, 4 of them done before" in capsys.readouterr().err
+    assert (tmp_path / "results.csv").read_text().startswith(before)
+    assert len(read_results(tmp_path)) == 8
+
+    assert run(*common, "--overwrite", "--seed", 1) == 0
+    assert "done before" not in capsys.readouterr().err
+    assert [row["seed"] for row in read_results(tmp_path)] == ["1"] * 4
+    # The instances are other ones than those of the folder.
+    assert "holds results of other instances" in user_error(capsys, *common, "--instances", inputs.large)
+    assert [row["seed"] for row in read_results(tmp_path)] == ["1"] * 4
+
+
+def test_zips_of_other_parameters_are_not_mixed_up(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A zip that was trained on, under its old name, is another solver."""
+    env = make_vec_env("RoutePlanning-N20-v0", 1, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
+    router = tmp_path / "router.zip"
+    arguments = ("--instances", inputs.small, "--out", tmp_path / "out", "--solvers", f"kmeans-am:router={router},name=AM")
+    for seed in (1, 2):
+        REINFORCE(RouterPolicy, env, policy_kwargs=dict(TINY), seed=seed, device="cpu").save(router)
+        if seed == 1:
+            assert run(*arguments) == run(*arguments) == 0
+    assert "holds results of another 'AM', whose router was" in user_error(capsys, *arguments)
+    assert run(*arguments, "--overwrite") == 0
+
+
+def test_solvers_that_fail_leave_the_others(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not installed, not made for this fleet, no time: each is named, the others' results are printed, the exit code is 3."""
+    monkeypatch.setitem(SOLVERS, "absent", "a_module_that_is_not_installed:Solver")
+    monkeypatch.setitem(SOLVERS, "timed", f"{__name__}:Timed")
+    UniformGenerator(5, n_uavs=5)(1, np.random.default_rng(0)).save(tmp_path / "U5.npz")
+    code = run(
+        *inputs.pair, "--instances", inputs.small, tmp_path / "U5.npz", "--out", tmp_path / "out",
+        "--time-limit", 0, "--solvers", "absent", "timed", "random-nearest",
+    )  # fmt: skip
+    assert code == 3
+    captured = capsys.readouterr()
+    for message in (
+        "DL-DRL (greedy) failed on 1 of 1 instances of U5: The allocator was trained for 3 UAVs",
+        "absent failed on 4 of 4 instances of U3-N20: No module named 'a_module_that_is_not_installed'",
+        "timed failed on 4 of 4 instances of U3-N20: Give timed a time limit above 0.",
+    ):
+        assert f"sb3-uav: {message}" in captured.err
+    printed = [line.split() for line in captured.out.splitlines() if "random-nearest" in line]
+    assert [line[-1] for line in printed] == ["4/4", "1/1"]
+    good = [(row["solver"], row["source"]) for row in read_results(tmp_path / "out") if row["status"] == "ok"]
+    assert good == [
+        *[("DL-DRL (greedy)", "U3-N20")] * 4,
+        *[("random-nearest", "U3-N20")] * 4,
+        ("random-nearest", "U5"),
+    ]
+
+
+def test_wrong_schedules_count_more_than_failures(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SOLVERS, "absent", "a_module_that_is_not_installed:Solver")
+    monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:OutOfRange")
+    common = ("--instances", inputs.small, "--out", tmp_path, "--solvers")
+    assert run(*common, "broken", "absent", "random-nearest") == 1
+    assert run(*common, "absent", "random-nearest") == 3
+    assert run(*common, "random-nearest") == 0
+
+
+def test_several_time_limits(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(SOLVERS, "timed", f"{__name__}:Timed")
+    common = (*inputs.pair, "--instances", inputs.small, "--out", tmp_path, "--solvers", "timed", "--time-limit")
+    assert run(*common, 0.5, 2) == 0
+    captured = capsys.readouterr()
+    assert captured.out.index("U3-N20: 4 instances, 0.5 s each") < captured.out.index("U3-N20: 4 instances, 2 s each")
+    lines = [line for line in captured.err.splitlines() if " on " in line]
+    assert lines == [
+        "DL-DRL (greedy) on U3-N20: 4 instances",
+        "timed on U3-N20: 4 instances, 0.5 s each",
+        "timed on U3-N20: 4 instances, 2 s each",
+    ]
+    found = [
+        (row["solver"], row["time_limit"], row["objective"]) for row in read_summary(tmp_path) if row["solver"] == "timed"
+    ]
+    assert found == [("timed", "0.5", "0.0"), ("timed", "2.0", "1.0")]
+    assert [row["time_limit"] for row in read_results(tmp_path)] == [""] * 4 + ["0.5"] * 4 + ["2.0"] * 4
 
 
 # ---------------------------------------------------------------------------------------------------------------- bad input
@@ -259,8 +359,11 @@ def test_wrong_zips(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert f"{tmp_path / 'no.zip'}: no such file" in error_for(inputs.allocator, tmp_path / "no.zip")
     assert "exchanged" in error_for(inputs.router, inputs.allocator)
     UniformGenerator(5, n_uavs=5)(1, np.random.default_rng(0)).save(tmp_path / "U5.npz")
-    message = user_error(capsys, *inputs.pair, "--instances", inputs.small, tmp_path / "U5.npz", "--out", tmp_path / "out")
+    message = user_error(capsys, *inputs.pair, "--instances", tmp_path / "U5.npz", "--out", tmp_path / "out")
     assert "U5: DL-DRL (greedy) cannot solve these instances" in message and "trained for 3 UAVs" in message
+    zips = f"allocator={inputs.router},router={inputs.router}"
+    assert "exchanged" in user_error(capsys, *common, "--solvers", "random-nearest", f"dl-drl:{zips}")
+    assert "no such file" in user_error(capsys, *common, "--solvers", "random-nearest", "kmeans-am:router=none.zip")
     assert not (tmp_path / "out").exists()
 
 
@@ -272,10 +375,14 @@ def test_wrong_arguments(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureF
         ((*common, "--allocator", inputs.allocator), "--allocator and --router go together; --router is missing."),
         ((*solver, "--router", inputs.router), "--allocator and --router go together; --allocator is missing."),
         ((*solver, "--untrained"), "--untrained needs --allocator and --router"),
-        ((*common, "--solvers", "magic"), "Unknown solver 'magic'; choose one of ['kmeans-nearest', 'random-nearest'"),
-        ((*common, "--solvers", "kmeans-nearest:k=3"), "has no option 'k=3'; its options are: restarts=<int>"),
+        ((*common, "--solvers", "magic"), "Unknown solver 'magic'; choose one of ['dl-drl', 'dl-drl-i'"),
+        ((*common, "--solvers", "kmeans-nearest:k=3"), "has no option 'k=3'; its options are: name=<str>, restarts=<int>"),
         ((*solver, "kmeans-nearest"), "Solver 'kmeans-nearest' is given twice"),
-        ((*solver, "--seed", -1), "--seed is -1; it must be at least 0."),
+        ((*solver, "--seed", -1), "The seed is -1; it must be at least 0."),
+        ((*solver, "--jobs", 0), "The number of jobs is 0; give at least 1."),
+        ((*solver, "--time-limit", 1, -1), "A time limit is -1.0; it must be a number of seconds, at least 0."),
+        ((*solver, "--reference", "magic"), "The reference 'magic' is none of the solvers ['kmeans-nearest']."),
+        ((*common, "--solvers", "dl-drl"), "Solver 'dl-drl' needs the option allocator=<str>"),
         ((*common, *inputs.pair, "--decode", "sampling", "--samples", 0), "samples is 0; give at least 1."),
         ((*common, *inputs.pair, "--batch-size", 0), "batch_size is 0; give at least 1."),
         ((*common, *inputs.pair, "--device", "abacus"), "device is 'abacus', which cannot be used"),
@@ -297,17 +404,15 @@ def test_packages_that_are_not_installed(
 ) -> None:
     monkeypatch.setitem(SOLVERS, "absent", "a_module_that_is_not_installed:Solver")
     common = ("--instances", inputs.small, "--out", tmp_path, "--solvers")
-    assert "No module named 'a_module_that_is_not_installed'" in user_error(capsys, *common, "absent")
+    message = user_error(capsys, *common, "absent")
+    assert "absent cannot solve these instances: No module named 'a_module_that_is_not_installed'" in message
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with monkeypatch.context() as context:
+        context.setitem(sys.modules, "tqdm", None)
+        assert "progress bar needs tqdm; run: pip install 'sb3-uav[solvers]'" in user_error(capsys, *common, "kmeans-nearest")
     monkeypatch.setitem(sys.modules, "rich.console", None)
     assert "pip install 'sb3-uav[solvers]'" in user_error(capsys, *common, "kmeans-nearest")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_to_evaluate_in_python(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="at least one solver"):
-        evaluate([], UniformGenerator(3)(1, np.random.default_rng(0)), tmp_path)
-    with pytest.raises(ValueError, match="at least one solver and one set"):
-        evaluate([make_solver("random-nearest")], {}, tmp_path)
 
 
 # -------------------------------------------------------------------------------------------------------------- the command
@@ -328,10 +433,34 @@ def test_unknown_command_names_the_choices(capsys: pytest.CaptureFixture[str]) -
     assert "evaluate" in capsys.readouterr().err
 
 
+def test_help_of_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
+    """It tells the files and the exit codes."""
+    with pytest.raises(SystemExit) as stop:
+        run("--help")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for word in (
+        "sb3-uav evaluate",
+        "results.csv",
+        "summary.json",
+        "exit code:",
+        "  3    a solver is not installed",
+        "dl-drl-i:",
+    ):
+        assert word in text
+
+
+@pytest.mark.parametrize("argv", [[], ["--"], ["--", "evaluate"], ["--nonsense"]])
+def test_no_command(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(argv)
+    assert stop.value.code == 2 and "sb3-uav: error: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", sorted(cli.FORWARDED))
 def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Everything after the command reaches its own parser, options included; its exit code comes back."""
-    module = types.ModuleType(f"sb3_uav.zoo.{command}")
+    module = types.ModuleType(cli.FORWARDED[command][0])
     received: list[Any] = []
 
     def main(argv: list[str]) -> int | None:
@@ -356,7 +485,6 @@ def test_as_a_process(inputs: Inputs, tmp_path: Path) -> None:
     assert done.returncode == 0 and done.stderr.endswith("random-nearest on U3-N20: 4 instances\n")
     assert "random-nearest" in done.stdout
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
-    assert tuple(read_results(tmp_path)[0]) == RESULT_COLUMNS
 
 
 def test_unreachable_tasks_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -301,7 +301,13 @@ def test_zips_and_log_are_left_in_the_folder(tmp_path):
     with (tmp_path / LOG_FILE).open() as file:
         rows = list(csv.DictReader(file))
     assert [row["level"] for row in rows] == [record.level for record in its.records]
-    assert list(rows[0]) == ["epoch", "level", "phase", "n_instances", "objective", "seconds"]
+    assert list(rows[0]) == ["epoch", "level", "phase", "n_instances", "objective", "seconds", "generation_seconds"]
+    for record in rows:
+        generated = float(record["generation_seconds"])
+        assert 0 <= generated <= float(record["seconds"])
+        # The first epoch of an intensive block may have left enough for the second.
+        if record["level"] == "allocator" or record["phase"] != "intensive":
+            assert (generated > 0) == (record["level"] == "router" and record["phase"] == "alternate")
     assert all(0 <= float(row["objective"]) <= N_TASKS and int(row["n_instances"]) == 8 for row in rows)
     folder = tmp_path / CHECKPOINT_FOLDER
     assert sorted(path.name for path in folder.iterdir()) == ["allocator_6.zip", "its_state.json", "router_8.zip"]

@@ -15,6 +15,7 @@ from sb3_uav.envs import Instances, Schedule, UniformGenerator
 from sb3_uav.envs.render import UAV_COLOURS
 from sb3_uav.plots import MapPanel, learning_curves, plot_learning_curves, plot_schedule, plot_schedules
 from sb3_uav.plots.learning_curves import read_its_log
+from sb3_uav.plots.schedule_map import schedules_figure
 
 ITS_LOG = """\
 epoch,level,phase,n_instances,objective,seconds
@@ -60,6 +61,27 @@ def test_map_of_a_schedule(instances: Instances, tmp_path: Path) -> None:
     assert width > 600 and height > 700
     assert set(UAV_COLOURS[:2]) <= colours_in(path)
     assert UAV_COLOURS[2] not in colours_in(path)
+
+
+def test_legend_and_extent_of_a_map(instances: Instances) -> None:
+    """Lengths and counts of every tour, what was skipped as a hollow circle, and a square that holds all points."""
+    (axes,) = schedules_figure([MapPanel(instances, 1, Schedule([[0, 1, 2], [3], []]))]).axes
+    points = np.vstack([instances.depot[1].numpy(), instances.tasks[1].numpy()])
+    loop = np.vstack([points[:4], points[0]])
+    length, single = np.linalg.norm(np.diff(loop, axis=0), axis=1).sum(), 2 * np.linalg.norm(points[4] - points[0])
+    expected = [
+        f"UAV 1: 3 tasks, length {length:.2f}",
+        f"UAV 2: 1 task, length {single:.2f}",
+        "UAV 3: 0 tasks, length 0.00",
+        "depot",
+        "8 tasks skipped",
+    ]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == expected
+    hollow = axes.get_legend().legend_handles[-1]
+    assert len(hollow.get_facecolor()) == 0 and len(hollow.get_edgecolor()) == 1
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    assert right - left == pytest.approx(top - bottom)
+    assert (points > (left, bottom)).all() and (points < (right, top)).all()
 
 
 def test_several_maps_side_by_side(instances: Instances, tmp_path: Path) -> None:
@@ -153,6 +175,10 @@ def test_curves_on_disk(log: Path, tmp_path: Path) -> None:
     plot_learning_curves(log, tmp_path / "plots" / "curves.png")
     assert only_file_in(tmp_path / "plots").name == "curves.png"
     assert matplotlib.image.imread(tmp_path / "plots" / "curves.png").shape[1] > 1000
+    # The folder of a run will do.
+    plot_learning_curves(log.parent, tmp_path / "same" / "curves.png")
+    same, first = (matplotlib.image.imread(tmp_path / name / "curves.png") for name in ("same", "plots"))
+    assert np.array_equal(same, first)
 
 
 def test_epochs_are_read_in_order(log: Path) -> None:

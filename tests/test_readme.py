@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,9 +30,19 @@ def test_example_of_the_first_screen(tmp_path, monkeypatch):
     load_policy(tmp_path / "run" / "router.zip", expected=RouterPolicy)
 
 
+def test_example_of_ppo():
+    example = EXAMPLES[1]
+    for full, small in (("n_envs=64", "n_envs=4"), ("learn(300_000)", "learn(320)")):
+        assert full in example
+        example = example.replace(full, small)
+    variables: dict[str, Any] = {}
+    exec(example, variables)
+    assert type(variables["model"].policy) is RouterPolicy and variables["model"].num_timesteps >= 320
+
+
 def test_example_of_own_instances(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(EXAMPLES[1], {})
+    exec(EXAMPLES[2], {})
     assert Instances.load(tmp_path / "my_instances.npz").n_uavs == 4
 
 

@@ -13,10 +13,12 @@ from hypothesis import given, settings
 
 from sb3_uav.envs import ClusteredGenerator, InstanceGenerator, Instances, UniformGenerator, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy, memory
-from sb3_uav.solvers import DLDRL, SOLVERS, Solver, dl_drl, make_solver
+from sb3_uav.solvers import DLDRL, SOLVERS, KMeansAM, Solver, dl_drl, make_solver
+from sb3_uav.solvers.batched import parameters_hash
 from sb3_uav.solvers.heuristics import KMeansNearest, kmeans
 
 TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
+HEURISTICS = ("kmeans-nearest", "random-nearest")
 
 
 def make_policy(policy_class: Any, n_uavs: int | None = None, **kwargs: Any) -> Any:
@@ -30,14 +32,18 @@ def make_pair(n_uavs: int = 3, **kwargs: Any) -> DLDRL:
     return DLDRL(make_policy(AllocatorPolicy, n_uavs), make_policy(RouterPolicy), **kwargs)
 
 
+def make_kmeans_am(**kwargs: Any) -> KMeansAM:
+    return KMeansAM(make_policy(RouterPolicy), **kwargs)
+
+
 def objectives(solver: Solver, instances: Instances, seed: int = 0) -> np.ndarray:
-    results = solver.solve(instances, seed)
+    results = solver.solve(instances, seed=seed)
     assert len(results) == len(instances)
     return np.array([check_schedule(instances, row, result.schedule).objective for row, result in enumerate(results)])
 
 
 def routes(solver: Solver, instances: Instances, seed: int = 0) -> list[tuple[tuple[int, ...], ...]]:
-    return [result.schedule.routes for result in solver.solve(instances, seed)]
+    return [result.schedule.routes for result in solver.solve(instances, seed=seed)]
 
 
 @pytest.fixture(scope="module")
@@ -55,23 +61,29 @@ def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
     reachable = batch.reachable().any(1).tolist()
     pair = make_pair(batch.n_uavs, decode="sampling", samples=3)
     augmented = make_pair(batch.n_uavs, decode="augment", samples=2 * dl_drl.N_TOURS)
-    for solver in (*map(make_solver, SOLVERS), pair, augmented, make_pair(batch.n_uavs)):
+    pairs = (pair, augmented, make_pair(batch.n_uavs), make_kmeans_am())
+    for solver in (*map(make_solver, HEURISTICS), *pairs):
         objectives(solver, batch)
         visited = [result.schedule.n_visited > 0 for result in solver.solve(batch)]
         assert visited == reachable, solver.name
 
 
-@pytest.mark.parametrize("spec", sorted(SOLVERS))
+@pytest.mark.parametrize("spec", [*HEURISTICS, "kmeans-am", "sampling"])
 def test_the_seed_decides(spec: str, instances: Instances) -> None:
     """Same seed, same schedules; the row of an instance, not the batch it comes in, decides what happens to it."""
-    solver = make_solver(spec)
+    networks = {"kmeans-am": make_kmeans_am(), "sampling": make_pair(decode="sampling", samples=3)}
+    solver = networks[spec] if spec in networks else make_solver(spec)
+    for rows in ([5, 2], [0], []):
+        expected = [(row, routes(solver, instances, 3)[row]) for row in rows]
+        found = [(row, result.schedule.routes) for row, result in solver.solve_rows(instances, rows, seed=3)]
+        assert found == expected
     assert routes(solver, instances, 3) == routes(solver, instances, 3)
     assert routes(solver, instances[:4], 3) == routes(solver, instances, 3)[:4]
     assert routes(make_solver("random-nearest"), instances, 3) != routes(make_solver("random-nearest"), instances, 4)
 
 
 def test_padding_changes_nothing(instances: Instances) -> None:
-    for solver in (*map(make_solver, SOLVERS), make_pair()):
+    for solver in (*map(make_solver, HEURISTICS), make_pair(), make_kmeans_am()):
         assert routes(solver, instances.pad(31)) == routes(solver, instances), solver.name
 
 
@@ -143,8 +155,8 @@ def test_greedy_is_the_policies_own_plan(instances: Instances) -> None:
 def test_batch_size_changes_only_the_timing(decode: str, batch_size: int, instances: Instances) -> None:
     pair = make_pair(decode=decode, samples=5)
     batched = make_pair(decode=decode, samples=5, batch_size=batch_size)
-    results = batched.solve(instances, 2)
-    assert [result.schedule for result in results] == [result.schedule for result in pair.solve(instances, 2)]
+    results = batched.solve(instances, seed=2)
+    assert [result.schedule for result in results] == [result.schedule for result in pair.solve(instances, seed=2)]
     sizes = {1: [1] * 9, 4: [4] * 8 + [1], 100: [9] * 9}[batch_size]
     assert [result.batch_size for result in results] == sizes
     assert all(result.seconds > 0 for result in results)
@@ -153,9 +165,9 @@ def test_batch_size_changes_only_the_timing(decode: str, batch_size: int, instan
 def test_memory_bounds_the_batch(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
     """With hardly any memory, instances are solved one by one, and nothing else changes."""
     pair = make_pair(decode="sampling", samples=3)
-    roomy = pair.solve(instances, 0)
+    roomy = pair.solve(instances, seed=0)
     monkeypatch.setattr(memory, "CPU_MEMORY", 1)
-    tight = pair.solve(instances, 0)
+    tight = pair.solve(instances, seed=0)
     assert [result.batch_size for result in tight] == [1] * 9
     assert [result.schedule for result in tight] == [result.schedule for result in roomy]
     monkeypatch.undo()
@@ -280,6 +292,52 @@ def test_arguments_of_dl_drl(kwargs: dict[str, Any], message: str) -> None:
         make_pair(**kwargs)
 
 
+# -------------------------------------------------------------------------------------------------------------- K-means+AM
+
+
+def test_kmeans_am_routes_the_clusters_of_kmeans(instances: Instances) -> None:
+    """Every tour is the router's own plan for one cluster, and the clusters are those of kmeans-nearest."""
+    solver = make_kmeans_am(batch_size=4)
+    for row, schedule in enumerate(routes(solver, instances, 7)):
+        clusters = kmeans(instances.tasks[row].numpy(), 3, np.random.default_rng([7, row]))
+        for uav, route in enumerate(schedule):
+            mine = np.nonzero(clusters == uav)[0].tolist()
+            subset = Instances.from_arrays(instances.depot[row], instances.tasks[row, mine])
+            assert list(route) == [mine[node - 1] for node in solver.router.plan(subset)[0].tolist() if node > 0]
+    assert [result.batch_size for result in solver.solve(instances)] == [4] * 8 + [1]
+
+
+def test_any_fleet_suits_kmeans_am() -> None:
+    batch = Instances.concatenate([UniformGenerator(n, n_uavs=7)(2, np.random.default_rng(n)) for n in (1, 5, 12)])
+    assert (objectives(make_kmeans_am(), batch) > 0).any()
+
+
+def test_wrong_arguments_of_kmeans_am() -> None:
+    with pytest.raises(ValueError, match="restarts of kmeans-am is 0; K-means needs at least 1 start"):
+        make_kmeans_am(restarts=0)
+    with pytest.raises(ValueError, match="batch_size is 0; give at least 1"):
+        make_kmeans_am(batch_size=0)
+
+
+# ---------------------------------------------------------------------------------------------------------------- settings
+
+
+def test_settings_tell_solvers_apart() -> None:
+    """What may change the schedules is in the settings; the batch size, the name and the device are not."""
+    pair = make_pair()
+    assert pair.settings() == make_pair(batch_size=3, name="other").settings() == make_pair(samples=3).settings()
+    sampling = [make_pair(decode="sampling", samples=samples) for samples in (3, 128)]
+    kmeans_am = make_kmeans_am()
+    different: list[Solver] = [pair, make_pair(4), *sampling, pair.untrained(), kmeans_am, make_kmeans_am(restarts=3)]
+    every = [solver.settings() for solver in different]
+    assert all(first != second for i, first in enumerate(every) for second in every[:i])
+    assert kmeans_am.settings()["router"] == parameters_hash(pair.router) == pair.settings()["router"]
+    with th.no_grad():
+        next(pair.router.parameters()).view(-1)[0] += 1e-6
+    assert parameters_hash(pair.router) != kmeans_am.settings()["router"]
+    assert make_solver("kmeans-nearest:restarts=3").settings() == {"spec": "kmeans-nearest:restarts=3"}
+
+
 # ---------------------------------------------------------------------------------------------------------------- registry
 
 
@@ -288,19 +346,32 @@ def test_options() -> None:
     assert isinstance(solver, KMeansNearest) and solver.restarts == 3
     assert solver.name == "kmeans-nearest:restarts=3"
     assert make_solver("kmeans-nearest").name == "kmeans-nearest"
+    named = make_solver("kmeans-nearest:name=K-means,restarts=4")
+    assert isinstance(named, KMeansNearest) and named.name == "K-means" and named.restarts == 4
+
+
+def test_defaults_are_for_solvers_that_have_them() -> None:
+    solver = make_solver("kmeans-nearest", restarts=3, device="cpu")
+    assert isinstance(solver, KMeansNearest) and solver.restarts == 3
+    solver = make_solver("kmeans-nearest:restarts=2", restarts=3)
+    assert isinstance(solver, KMeansNearest) and solver.restarts == 2
 
 
 @pytest.mark.parametrize(
     "spec, message",
     [
-        ("kmeans", r"Unknown solver 'kmeans'; choose one of \['kmeans-nearest', 'random-nearest'"),
-        ("kmeans-nearest:k=3", r"has no option 'k=3'; its options are: restarts=<int>"),
+        ("kmeans", r"Unknown solver 'kmeans'; choose one of \['dl-drl', 'dl-drl-i', .*'kmeans-am'"),
+        ("kmeans-nearest:k=3", r"has no option 'k=3'; its options are: name=<str>, restarts=<int>"),
         ("kmeans-nearest:restarts", r"has no option 'restarts'"),
-        ("random-nearest:restarts=2", r"has no option 'restarts=2'; its options are: none"),
+        ("random-nearest:restarts=2", r"has no option 'restarts=2'; its options are: name=<str>\."),
         ("kmeans-nearest:restarts=two", r"'restarts=two' of solver 'kmeans-nearest' must be of type int"),
         ("kmeans-nearest:restarts=__import__('os')", "must be of type int"),
         ("kmeans-nearest:restarts=1,restarts=2", "given the option 'restarts' twice"),
         ("kmeans-nearest:restarts=0", "at least 1 start"),
+        ("dl-drl", r"'dl-drl' needs the option allocator=<str>; it has: allocator=<str>, batch_size=<int>, decode=<str>"),
+        ("dl-drl:allocator=a.zip", "'dl-drl' needs the option router=<str>"),
+        ("dl-drl-i:allocator=a.zip,router=r.zip,batch_size=few", "must be of type int"),
+        ("kmeans-am:restarts=2", "'kmeans-am' needs the option router=<str>"),
     ],
 )
 def test_wrong_options(spec: str, message: str) -> None:

@@ -15,6 +15,8 @@ logger = logging.getLogger(__name__)
 # Okabe and Ito's palette, readable with colour-vision deficiencies.
 UAV_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C6D31", "#000000")
 
+# Sides of the map, in units of the points' extent.
+BORDER = 1.08
 MARGINS = {"left": 0.1, "right": 0.9, "bottom": 0.1, "top": 0.9}
 
 
@@ -33,7 +35,7 @@ def require_matplotlib() -> Any:
 
 def draw_map(axes: Any, instances: Instances, row: int, routes: Sequence[Sequence[int]], title: str = "") -> None:
     """
-    Draw depot, tours coloured by UAV, and skipped tasks as hollow circles.
+    Draw depot, tours coloured by UAV, and skipped tasks as hollow circles, on a square of the plane that holds all points.
 
     :param axes: matplotlib axes
     :param instances: The instances
@@ -45,21 +47,32 @@ def draw_map(axes: Any, instances: Instances, row: int, routes: Sequence[Sequenc
     tasks = instances.tasks[row][instances.task_mask[row]].numpy()
     visited = {task for route in routes for task in route}
     skipped = [task for task in range(len(tasks)) if task not in visited]
-    axes.scatter(*tasks[skipped].T, s=22, facecolors="none", edgecolors="0.55", linewidths=0.9, zorder=2)
     for uav, route in enumerate(routes):
         colour = UAV_COLOURS[uav % len(UAV_COLOURS)]
         path = np.vstack([depot, tasks[list(route)], depot])
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-        label = f"UAV {uav + 1}: {len(route)} tasks, length {length:.2f}"
+        label = f"UAV {uav + 1}: {_counted(len(route))}, length {length:.2f}"
         axes.plot(*path.T, color=colour, linewidth=1.4, zorder=3, label=label)
         axes.scatter(*path[1:-1].T, s=22, color=colour, zorder=4)
-    axes.scatter(*depot, marker="s", s=70, color="black", zorder=5, label=f"depot, {len(skipped)} tasks skipped")
+    axes.scatter(*depot, marker="s", s=70, color="black", zorder=5, label="depot")
+    hollow = dict(s=22, facecolors="none", edgecolors="0.55", linewidths=0.9, zorder=2)
+    axes.scatter(*tasks[skipped].T, **hollow, label=f"{_counted(len(skipped))} skipped")
+    points = np.vstack([depot, tasks])
+    low, high = points.min(0), points.max(0)
+    # Of one point, any square will do.
+    half = BORDER * float((high - low).max() or 1.0) / 2
+    for set_limits, middle in zip((axes.set_xlim, axes.set_ylim), (low + high) / 2, strict=True):
+        set_limits(middle - half, middle + half)
     axes.set_aspect("equal")
     axes.set_xticks([])
     axes.set_yticks([])
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, fontsize=8, frameon=False)
     if title:
         axes.set_title(title, fontsize=11)
+
+
+def _counted(n_tasks: int) -> str:
+    return f"{n_tasks} task" if n_tasks == 1 else f"{n_tasks} tasks"
 
 
 class MapFigure:

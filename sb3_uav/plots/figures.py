@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,18 +34,20 @@ def new_figure(width: float, height: float) -> Any:
     return require_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path, metadata: Mapping[str, str] | None = None) -> None:
     """
     Write a figure under a temporary name and rename it.
 
     :param figure: The figure
     :param path: From :func:`checked_path`; its folder is created if missing
+    :param metadata: Written into the file, under keys that its format has
     """
     temporary = path.with_name(path.name + ".tmp")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         # Legends below a map lie outside its axes, which the layout does not always leave room for.
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=150, bbox_inches="tight", pad_inches=0.12)
+        kind = path.suffix[1:].lower()
+        figure.savefig(temporary, format=kind, dpi=150, bbox_inches="tight", pad_inches=0.12, metadata=metadata)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

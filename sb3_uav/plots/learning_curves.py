@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from sb3_uav.plots.figures import checked_path, new_figure, save_figure
 
+LOG_FILE = "its_log.csv"
 LEVELS = ("allocator", "router")
 COLUMNS = {"epoch", "level", "phase", "objective"}
 PHASE_COLOURS = {"pre-training": "#56B4E9", "intensive": "#E69F00", "alternate": "#009E73"}
@@ -36,7 +37,7 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
     """
     Draw the mean objective of every epoch, the allocator above and the router below, phases of the strategy shaded.
 
-    :param its_log: The ``its_log.csv`` of a run
+    :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
     :raises FileNotFoundError: If there is no such log
     :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers, or the suffix of the
@@ -55,12 +56,14 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
 
 def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]]:
     """
-    :param its_log: The ``its_log.csv`` of a run
+    :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :return: The epochs of each level, in order; a level may have none
     :raises FileNotFoundError: If there is no such log
     :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers
     """
     its_log = Path(its_log)
+    if its_log.is_dir():
+        its_log /= LOG_FILE
     if not its_log.is_file():
         raise FileNotFoundError(f"{its_log}: no such log; give the its_log.csv of a run of the interactive training strategy.")
     epochs: dict[str, list[LoggedEpoch]] = {level: [] for level in LEVELS}

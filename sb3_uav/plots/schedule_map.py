@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.render import draw_map
@@ -59,18 +59,30 @@ def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> 
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
+    save_figure(schedules_figure(panels), path)
+
+
+def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -> Any:
+    """
+    :param panels: What to draw
+    :param n_columns: How many of them stand in a line
+    :return: A matplotlib figure
+    :raises ValueError: If there are no panels
+    :raises ImportError: If matplotlib is not installed
+    """
     if not panels:
         raise ValueError("There is nothing to draw: give at least one panel.")
-    n_columns = min(len(panels), MAX_COLUMNS)
+    n_columns = min(len(panels), n_columns)
     n_lines = math.ceil(len(panels) / n_columns)
-    legend_lines = math.ceil((1 + max(len(panel.schedule.routes) for panel in panels)) / 2)
+    # Depot and skipped tasks have entries too.
+    legend_lines = math.ceil((2 + max(len(panel.schedule.routes) for panel in panels)) / 2)
     height = PANEL_HEIGHT + LEGEND_LINE_HEIGHT * legend_lines
     figure = new_figure(PANEL_WIDTH * n_columns, height * n_lines)
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):
         draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
-        # Maps of other proportions leave room below, not above.
+        # What room there is too much belongs to the legend.
         axes.set_anchor("N")
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    save_figure(figure, path)
+    return figure

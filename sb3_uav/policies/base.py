@@ -61,6 +61,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+# Into how many times as many slots as there are transitions they may be sorted by instance, when some instances have many
+# transitions and others few; beyond, every transition gets a copy of its instance's encoding instead.
+MAX_FILLING = 4
+
+
 class Cache(NamedTuple):
     """
     What decoding needs of an encoded instance. Every tensor leads with the batch dimension.
@@ -74,6 +79,13 @@ class Cache(NamedTuple):
 
     def detach(self) -> Cache:
         return Cache(self.nodes.detach(), tuple(projection.detach() for projection in self.projections))
+
+    def rows(self, rows: th.Tensor) -> Cache:
+        """
+        :param rows: ``(n,)`` int64
+        :return: The encodings of these instances, in this order
+        """
+        return Cache(self.nodes[rows], tuple(projection[rows] for projection in self.projections))
 
     def update_rows(self, rows: th.Tensor, fresh: Cache) -> Cache:
         """
@@ -193,13 +205,18 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         if index is None and th.is_grad_enabled() and self.share_encodings:
             static, index = static.unique()
         if index is None:
-            cache = self._encode_cached(static)
-            state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
-            return self.decode(cache, state)[:, 0]
+            return self._decode_each(self._encode_cached(static), dynamic)
         grouping = Grouping.by_instance(index, len(static.depot))
         cache = self.encode(static)
+        if grouping.source.numel() > MAX_FILLING * len(index):
+            return self._decode_each(cache.rows(index), dynamic)
         state = self.observed_state(cache, {key: grouping.gather(value) for key, value in dynamic.items()})
         return grouping.scatter(self.decode(cache, state))
+
+    def _decode_each(self, cache: Cache, dynamic: TensorDict) -> th.Tensor:
+        """:return: Features of one transition of every instance, ``(batch, features_dim)``"""
+        state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
+        return self.decode(cache, state)[:, 0]
 
     def _encode_cached(self, static: StaticObservation) -> Cache:
         if self.training or th.is_grad_enabled() or not self.use_cache:

@@ -96,13 +96,15 @@ class InstanceNorm(nn.Module):
         :return: ``(batch, n_nodes, embed_dim)``
         """
         if node_mask is None:
-            variance, mean = th.var_mean(nodes, dim=1, keepdim=True, correction=0)
+            # th.var_mean is four times as slow on CPUs.
+            centred = nodes - nodes.mean(1, keepdim=True)
+            variance = (centred**2).mean(1, keepdim=True)
         else:
             real = node_mask[..., None]
             count = real.sum(1, keepdim=True)
-            mean = nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-            variance = ((nodes - mean) ** 2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-        return (nodes - mean) * (variance + 1e-5).rsqrt() * self.weight + self.bias
+            centred = nodes - nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
+            variance = (centred**2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
+        return centred * ((variance + 1e-5).rsqrt() * self.weight) + self.bias
 
 
 class NodeNorm(nn.Module):

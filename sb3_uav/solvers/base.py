@@ -5,9 +5,12 @@ from __future__ import annotations
 import inspect
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, get_type_hints
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ClassVar, NamedTuple, get_args
 
 import numpy as np
 
@@ -36,10 +39,24 @@ class Solver(ABC):
     """
     Turns instances into schedules.
 
+    :cvar uses_time_limit: Whether it may find other schedules with another time limit; if not, evaluations at several time
+        limits run it once
     :ivar name: How tables and files call it
+    :ivar spec: The text that :func:`make_solver` made it from
+    :ivar files: Files that it was made from, by their purpose; evaluations record their hashes
     """
 
+    uses_time_limit: ClassVar[bool] = True
     name: str
+    spec: str | None = None
+    files: Mapping[str, Path] = {}
+
+    def settings(self) -> dict[str, Any]:
+        """
+        :return: What decides its results beside instances, time limit and seed, as plain data; results of earlier evaluations
+            are used again only if it is the same
+        """
+        return {} if self.spec is None else {"spec": self.spec}
 
     def check(self, instances: Instances) -> None:  # noqa: B027 (most solvers take any instances)
         """
@@ -50,81 +67,159 @@ class Solver(ABC):
         """
 
     @abstractmethod
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         """
         :param instances: ``batch`` instances on the CPU, possibly padded
-        :param seed: Of all the randomness; the same seed gives the same schedules
+        :param time_limit: Seconds per instance for solvers that can use more or less of them; their own default when None.
+            Others ignore it
+        :param seed: Of all the randomness; without a time limit the same seed gives the same schedules
         :return: One result per instance
         :raises ValueError: If the solver cannot treat these instances, see :meth:`check`
         """
+
+    def solve_rows(
+        self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
+    ) -> Iterator[tuple[int, SolverResult]]:
+        """
+        Solve some of the instances exactly as :meth:`solve` solves them among all, and hand out what is known already.
+
+        :param instances: ``batch`` instances on the CPU, possibly padded
+        :param rows: Indices of those to solve
+        :param time_limit: As for :meth:`solve`
+        :param seed: As for :meth:`solve`
+        :return: Index and result of each
+        """
+        results = self.solve(instances, time_limit, seed)
+        if len(results) != len(instances):
+            raise ValueError(f"{self.name} returned {len(results)} results for {len(instances)} instances.")
+        for row in rows:
+            yield row, results[row]
+
+
+class Solution(NamedTuple):
+    """
+    :param schedule: The schedule
+    :param bound: A proven upper bound of the objective, where the solver knows one
+    """
+
+    schedule: Schedule
+    bound: float | None = None
 
 
 class OneByOneSolver(Solver):
     """A solver that treats every instance alone, with random numbers that depend on the seed and its row only."""
 
     @abstractmethod
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         """
         :param instance: A batch of one, without padding
+        :param time_limit: Seconds, or None for the solver's own default
         :param rng: The source of randomness
-        :return: The schedule
+        :return: The schedule, and a bound where one is known
         """
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
-        results = []
-        for row, n_tasks in enumerate(instances.task_mask.sum(1).tolist()):
-            start = time.perf_counter()
-            # A row that is all padding keeps one slot, because no instance has none.
-            schedule = self.solve_one(instances[row].trim(max(n_tasks, 1)), np.random.default_rng([seed, row]))
-            results.append(SolverResult(schedule, time.perf_counter() - start))
-        return results
+    def solve_row(self, instance: Instances, row: int, time_limit: float | None = None, seed: int = 0) -> SolverResult:
+        """
+        :param instance: A batch of one, possibly padded
+        :param row: Its index in what is being solved
+        :param time_limit: As for :meth:`solve`
+        :param seed: As for :meth:`solve`
+        :return: What :meth:`solve` finds for that row
+        """
+        start = time.perf_counter()
+        # A row that is all padding keeps one slot, because no instance has none.
+        trimmed = instance.trim(max(int(instance.task_mask.sum()), 1))
+        solution = self.solve_one(trimmed, time_limit, np.random.default_rng([seed, row]))
+        return SolverResult(solution.schedule, time.perf_counter() - start, bound=solution.bound)
+
+    def solve_rows(
+        self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
+    ) -> Iterator[tuple[int, SolverResult]]:
+        for row in rows:
+            yield row, self.solve_row(instances[row], row, time_limit, seed)
+
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
+        return [result for _, result in self.solve_rows(instances, range(len(instances)), time_limit, seed)]
 
 
-# Name -> "module:class". The module is imported when the solver is made, so that only those that are used must be installed.
+# Name -> "module:class", or a function that returns a solver. The module is imported when the solver is made, so that only
+# those that are used must be installed.
 SOLVERS: dict[str, str] = {
+    "dl-drl": "sb3_uav.solvers.dl_drl:load_dl_drl",
+    # The paper's name for pairs whose router was not trained with the allocator.
+    "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl",
+    "kmeans-am": "sb3_uav.solvers.kmeans_am:load_kmeans_am",
+    "greedy-insertion": "sb3_uav.solvers.insertion:GreedyInsertion",
+    "milp": "sb3_uav.solvers.milp:MILP",
+    "ortools": "sb3_uav.solvers.ortools_routing:ORTools",
+    "ortools-gls": "sb3_uav.solvers.ortools_routing:ORToolsGLS",
+    "pyvrp": "sb3_uav.solvers.pyvrp_search:PyVRP",
     "kmeans-nearest": "sb3_uav.solvers.heuristics:KMeansNearest",
+    "kmeans-vnd": "sb3_uav.solvers.kmeans_vnd:KMeansVND",
     "random-nearest": "sb3_uav.solvers.heuristics:RandomNearest",
 }
 
 
-def make_solver(spec: str) -> Solver:
+def make_solver(spec: str, **defaults: Any) -> Solver:
     """
     Make a solver from text.
 
-    :param spec: ``name`` or ``name:key=value,key=value``; the keys are the arguments of the solver's constructor
-    :return: The solver; its ``name`` is the whole ``spec``, so that variants can be told apart
+    :param spec: ``name`` or ``name:key=value,key=value``; the keys are the arguments of the solver's constructor, and
+        ``name``, which tables and files shall call it by
+    :param defaults: Arguments for solvers that have them, where ``spec`` does not give them
+    :return: The solver; unless told otherwise its ``name`` is the whole ``spec``, so that variants can be told apart
     :raises ValueError: If the name, a key or a value is not allowed; the message lists the choices
+    :raises ImportError: If the solver needs a package that is not installed
     """
     name, _, text = spec.partition(":")
     if name not in SOLVERS:
         raise ValueError(f"Unknown solver {name!r}; choose one of {sorted(SOLVERS)}.")
     module, _, attribute = SOLVERS[name].partition(":")
-    solver_class: type[Solver] = getattr(import_module(module), attribute)
-    solver = solver_class(**_parse_options(name, text, solver_class))
-    solver.name = spec
+    factory: Callable[..., Solver] = getattr(import_module(module), attribute)
+    options, label = _parse_options(name, text, factory, defaults)
+    solver = factory(**options)
+    solver.name, solver.spec = label or spec, spec
     return solver
 
 
-def _parse_options(name: str, text: str, solver_class: type[Solver]) -> dict[str, Any]:
+def _parse_options(
+    name: str, text: str, factory: Callable[..., Solver], defaults: Mapping[str, Any]
+) -> tuple[dict[str, Any], str]:
     """
     :param name: Name of the solver, for errors
     :param text: ``key=value,key=value``, or nothing
-    :param solver_class: Whose constructor says which keys there are, and of which type
-    :return: Arguments of the constructor
-    :raises ValueError: If a key or a value is not allowed
+    :param factory: A class or a function, whose arguments say which keys there are, and of which type
+    :param defaults: Arguments where the text does not give them
+    :return: The arguments, and the label that the text gives the solver, if any
+    :raises ValueError: If a key or a value is not allowed, or one is missing
     """
-    hints = get_type_hints(solver_class.__init__)
-    choices = {key: hints[key] for key in inspect.signature(solver_class).parameters}
+    parameters = inspect.signature(factory, eval_str=True).parameters
+    choices = {key: _plain_type(parameter.annotation) for key, parameter in parameters.items()} | {"name": str}
+    known = ", ".join(f"{option}=<{hint.__name__}>" for option, hint in sorted(choices.items()))
     options: dict[str, Any] = {}
     for item in filter(None, text.split(",")):
         key, equals, value = item.partition("=")
         if not equals or key not in choices:
-            known = ", ".join(f"{option}=<{hint.__name__}>" for option, hint in sorted(choices.items())) or "none"
             raise ValueError(f"Solver {name!r} has no option {item!r}; its options are: {known}.")
         if key in options:
             raise ValueError(f"Solver {name!r} is given the option {key!r} twice.")
         options[key] = _parse_value(f"Option {item!r} of solver {name!r}", value, choices[key])
-    return options
+    label = options.pop("name", "")
+    options = {key: value for key, value in defaults.items() if key in parameters} | options
+    missing = [key for key, parameter in parameters.items() if parameter.default is parameter.empty and key not in options]
+    if missing:
+        raise ValueError(f"Solver {name!r} needs the option {missing[0]}=<{choices[missing[0]].__name__}>; it has: {known}.")
+    return options, label
+
+
+def _plain_type(hint: Any) -> type:
+    """
+    :param hint: Type hint of an option
+    :return: The type that a value given as text must have, without the None that stands for its absence
+    """
+    if isinstance(hint, UnionType):
+        (hint,) = (kind for kind in get_args(hint) if kind is not NoneType)
+    return hint
 
 
 def _parse_value(what: str, value: str, kind: type) -> Any:

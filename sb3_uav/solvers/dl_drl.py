@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from typing import TypeVar
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,7 +15,8 @@ from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
-from sb3_uav.solvers.base import Solver, SolverResult
+from sb3_uav.policies.loading import load_policy
+from sb3_uav.solvers.batched import BatchedSolver, parameters_hash
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
@@ -41,7 +43,7 @@ def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
     return fresh.to(policy.device)
 
 
-class DLDRL(Solver):
+class DLDRL(BatchedSolver):
     """
     DL-DRL: an allocator and a router, both trained.
 
@@ -71,13 +73,11 @@ class DLDRL(Solver):
             raise ValueError(f"decode is {decode!r}; choose one of {DECODINGS}.")
         if samples < 1:
             raise ValueError(f"samples is {samples}; give at least 1.")
-        if batch_size is not None and batch_size < 1:
-            raise ValueError(f"batch_size is {batch_size}; give at least 1.")
+        super().__init__(batch_size)
         self.allocator = allocator
         self.router = router
         self.decode = decode
         self.samples = samples
-        self.batch_size = batch_size
         self.name = f"DL-DRL ({self._decoding})" if name is None else name
 
     @property
@@ -96,29 +96,17 @@ class DLDRL(Solver):
     def check(self, instances: Instances) -> None:
         self.allocator.check_fleet(instances)
 
-    def solve(self, instances: Instances, seed: int = 0) -> list[SolverResult]:
-        self.check(instances)
-        self.allocator.set_training_mode(False)
-        n_samples = 1 if self.decode == "greedy" else SAMPLE_BLOCK
-        fitting = self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
-        batch_size = min(self.batch_size or fitting, fitting)
-        results = []
-        for rows in th.arange(len(instances)).split(batch_size):
-            start = time.perf_counter()
-            found = self._solve_batch(instances[rows], rows.tolist(), seed)
-            seconds = (time.perf_counter() - start) / len(rows)
-            results += [SolverResult(schedule, seconds, len(rows)) for schedule in found]
-        return results
+    def settings(self) -> dict[str, Any]:
+        networks = {"allocator": parameters_hash(self.allocator), "router": parameters_hash(self.router)}
+        return {**networks, "decoding": self._decoding}
 
-    def _solve_batch(self, instances: Instances, rows: list[int], seed: int) -> list[Schedule]:
-        """
-        :param instances: ``batch`` instances
-        :param rows: Their indices in what is being solved
-        :param seed: Of the samples
-        :return: The best schedule found for each
-        """
-        n_tasks = max(int(instances.task_mask.sum(1).max()), 1)
-        instances = instances.trim(n_tasks).to(self.allocator.device)
+    def rows_that_fit(self, instances: Instances) -> int:
+        n_samples = SAMPLE_BLOCK if self.decode == "sampling" else 1
+        return self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
+
+    def solve_batch(self, instances: Instances, rows: Sequence[int], seed: int) -> list[Schedule]:
+        self.allocator.set_training_mode(False)
+        instances = instances.to(self.allocator.device)
         if self.decode == "augment":
             return [self._augment(instances[i], random_generator(instances, seed, row)) for i, row in enumerate(rows)]
         order = self.allocator.task_order(instances)
@@ -164,7 +152,7 @@ class DLDRL(Solver):
         view, sample = divmod(int(planned.value.argmax()), assignment.shape[1])
         return schedules(in_input_order(planned.tours[view : view + 1, sample], orders[view : view + 1]))[0]
 
-    def _sample_block(self, instances: Instances, cache: Cache, rows: list[int], seed: int, first: int) -> th.Tensor:
+    def _sample_block(self, instances: Instances, cache: Cache, rows: Sequence[int], seed: int, first: int) -> th.Tensor:
         """
         Sample one block of allocations, instance by instance, each from random numbers of its own.
 
@@ -202,3 +190,28 @@ def in_input_order(tours: th.Tensor, order: th.Tensor) -> th.Tensor:
     """
     tasks = order.gather(1, tours.clamp(min=0).flatten(1)).view_as(tours)
     return tasks.masked_fill(tours < 0, -1)
+
+
+def load_dl_drl(
+    allocator: str,
+    router: str,
+    decode: str = "greedy",
+    samples: int = 128,
+    device: str = "auto",
+    batch_size: int | None = None,
+) -> DLDRL:
+    """
+    :param allocator: SB3 zip of the allocator
+    :param router: SB3 zip of the router
+    :param decode: ``"greedy"``, ``"sampling"`` or ``"augment"``
+    :param samples: Number of sampled allocations per instance
+    :param device: Device of the networks
+    :param batch_size: How many instances to solve at once; as many as memory allows when None
+    :return: The solver
+    :raises FileNotFoundError: If a zip is missing
+    :raises ValueError: If a zip is damaged or holds another policy, or an argument is not allowed
+    """
+    networks = load_policy(allocator, device, AllocatorPolicy), load_policy(router, device, RouterPolicy)
+    solver = DLDRL(*networks, decode, samples, batch_size)
+    solver.files = {"allocator": Path(allocator), "router": Path(router)}
+    return solver

@@ -2,53 +2,58 @@
 
 from __future__ import annotations
 
-import csv
-import json
+import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, TextIO
-
-import numpy as np
+from typing import Any
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, ScheduleReport, check_schedule, schedule_to_json
-from sb3_uav.solvers.base import Solver
+from sb3_uav.solvers.base import Solver, SolverResult
+from sb3_uav.solvers.comparison import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarise, write_summary
+from sb3_uav.solvers.results import (
+    FAILED,
+    INFEASIBLE,
+    OK,
+    RESULTS_FILE,
+    SCHEDULES_FILE,
+    EvaluationFolder,
+    ResultKey,
+    ResultRow,
+    locked_folder,
+    one_line,
+)
+from sb3_uav.solvers.running import Failure, Runner
+from sb3_uav.solvers.tables import print_table
 
-RESULT_COLUMNS = ("solver", "instance", "n_uavs", "n_tasks", "objective", "length", "seconds", "feasible")
-RESULTS_FILE = "results.csv"
-SCHEDULES_FILE = "schedules.jsonl"
-# Where the output is not a terminal, rich assumes 80 columns and would break the names of solvers.
-FILE_WIDTH = 120
+__all__ = ["RESULTS_FILE", "SCHEDULES_FILE", "SummaryRow", "UnavailableSolver", "evaluate", "find_reference", "print_table"]
+
+logger = logging.getLogger(__name__)
+
+# What is done, how many instances of it are done already, and how many there are.
+Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class SummaryRow:
+class UnavailableSolver(Solver):
     """
-    What one solver achieved on one set of instances.
+    Stands for a solver that could not be made, so that the evaluation of the others says so.
 
-    :param solver: Name of the solver
-    :param source: Name of the set
-    :param n_instances: Number of its instances
-    :param objective: Mean objective of the feasible schedules; NaN if there are none
-    :param standard_error: Of that mean; NaN with fewer than two
-    :param seconds: Mean wall time per instance
-    :param batch_size: How many instances were solved at once (the largest batch)
-    :param violations: What the checker said of infeasible schedules, one line each
+    :param spec: The text that it should have been made from
+    :param reason: Why it could not be
     """
 
-    solver: str
-    source: str
-    n_instances: int
-    objective: float
-    standard_error: float
-    seconds: float
-    batch_size: int
-    violations: tuple[str, ...] = ()
+    def __init__(self, spec: str, reason: str) -> None:
+        self.name = self.spec = spec
+        self.reason = reason
+
+    def check(self, instances: Instances) -> None:
+        raise ValueError(self.reason)
+
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
+        raise ValueError(self.reason)
 
 
 def evaluate(
@@ -56,195 +61,250 @@ def evaluate(
     instances: Instances | Mapping[str, Instances],
     out_dir: str | os.PathLike[str],
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+    time_limits: Sequence[float | None] = (None,),
+    n_jobs: int = 1,
+    reference: str | None = None,
+    resume: bool = False,
 ) -> list[SummaryRow]:
     """
-    Run every solver on every instance, check all schedules, and write ``results.csv`` and ``schedules.jsonl``.
+    Run every solver on every instance, check all schedules, and compare the solvers.
 
-    With several sets of instances, the column ``instance`` counts through all of them in the order given. A schedule that the
-    checker refuses is written with ``feasible`` False and without an objective. The files appear when all has been done;
-    until then, whatever an earlier evaluation wrote there stays.
+    Writes ``results.csv`` and ``schedules.jsonl``, row by row as results become known; ``evaluation.json``, which tells what
+    was evaluated, with which settings, versions and hashes; and at the end ``summary.csv`` and ``summary.json``. With several
+    sets of instances, the column ``instance`` counts through all of them in the order given. What a solver finds for an
+    instance depends on the seed and the row of the instance in its set.
+
+    A schedule that the checker refuses is written with ``feasible`` False and without an objective. Where a solver refuses the
+    instances or fails on one, ``status`` is ``failed`` and ``message`` says why; the other solvers go on.
 
     :param solvers: The solvers, with different names
     :param instances: The instances, or several named sets of them
-    :param out_dir: Folder of the two files, created if missing
+    :param out_dir: Folder of the files, created if missing
     :param seed: Seed of the solvers
-    :param progress: Called with a line of text before each solver starts on each set
-    :return: One row per solver and set, in the order of the sets
-    :raises ValueError: If there is nothing to do, two solvers have the same name, the folder cannot be written, or a solver
-        refuses the instances
+    :param progress: Called before each solver starts on each set and after each of its instances
+    :param time_limits: Seconds per instance for solvers that use them, None for their default; all are run one after the other
+    :param n_jobs: In how many processes to run solvers that treat instances one by one; each has one thread, and their times
+        are those of a busy machine. Scripts need the usual ``if __name__ == "__main__"``
+    :param reference: Name of the solver that the others are compared with; the first when None
+    :param resume: Go on with the results of the same solvers and instances in the folder, but for failed ones, instead of
+        starting anew. A solver counts as the same if its name and its settings are: change the name when you change its code
+    :return: One row per set, time limit and solver, in this order
+    :raises ValueError: If there is nothing to do, an argument is not allowed, two solvers have the same name, every solver
+        refuses the instances, the folder cannot be written, or it holds something that cannot be continued
     """
-    sets = {"instances": instances} if isinstance(instances, Instances) else dict(instances)
+    sources = {"instances": instances} if isinstance(instances, Instances) else dict(instances)
+    sources = {source: batch.to("cpu") for source, batch in sources.items()}
+    time_limits = [None if time_limit is None else float(time_limit) for time_limit in time_limits]
+    _check_arguments(solvers, sources, seed, time_limits)
+    reference = find_reference(solvers, reference)
+    refusals = _refusals(solvers, sources)
+    run = {
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "solvers": [solver.name for solver in solvers],
+        "seed": seed,
+        "time_limits": time_limits,
+        "n_jobs": n_jobs,
+    }
+    out_dir = Path(out_dir)
+    summary: list[SummaryRow] = []
+    with Runner(n_jobs) as runner, locked_folder(out_dir):
+        with EvaluationFolder(out_dir, sources, solvers, run, resume) as folder:
+            if folder.changed_versions:
+                changes = ", ".join(folder.changed_versions)
+                logger.warning(f"{out_dir}: holds results of other versions ({changes}); --overwrite starts anew.")
+            # They tell of other results than those that are going to be.
+            for name in (SUMMARY_CSV, SUMMARY_JSON):
+                (out_dir / name).unlink(missing_ok=True)
+            first_index = 0
+            for source, batch in sources.items():
+                evaluation = _SetEvaluation(source, batch, first_index, seed, folder, runner, progress)
+                for time_limit in time_limits:
+                    results = {
+                        solver.name: evaluation.rows(solver, time_limit, refusals.get((source, solver.name)))
+                        for solver in solvers
+                    }
+                    summary += summarise(source, results, reference, time_limit)
+                first_index += len(batch)
+        write_summary(summary, out_dir, {"reference": reference, "seed": seed})
+    return summary
+
+
+def find_reference(solvers: Sequence[Solver], reference: str | None) -> str:
+    """
+    :param solvers: The solvers
+    :param reference: Name of one of them, or its beginning up to the colon; the first one when None
+    :return: The whole name
+    :raises ValueError: If it names none of them, or several
+    """
     names = [solver.name for solver in solvers]
-    if not names or not sets:
+    if reference is None:
+        return names[0]
+    found = [name for name in names if name == reference] or [name for name in names if name.partition(":")[0] == reference]
+    if len(found) != 1:
+        raise ValueError(f"The reference {reference!r} is {'none' if not found else 'several'} of the solvers {names}.")
+    return found[0]
+
+
+def _check_arguments(
+    solvers: Sequence[Solver], sources: Mapping[str, Instances], seed: int, time_limits: Sequence[float | None]
+) -> None:
+    """
+    :raises ValueError: If an argument of :func:`evaluate` is not allowed
+    """
+    names = [solver.name for solver in solvers]
+    if not names or not sources or not time_limits:
         raise ValueError("There is nothing to evaluate: give at least one solver and one set of instances.")
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"Solver {name!r} is given twice; every solver needs a name of its own.")
-    for source, batch in sets.items():
+    for name in (*names, *sources):
+        if "\n" in name or "\r" in name:
+            raise ValueError(f"The name {name!r} breaks the line; give another one.")
+    if seed < 0:
+        raise ValueError(f"The seed is {seed}; it must be at least 0.")
+    for time_limit in time_limits:
+        # Whether 0 is enough is for the solver to say.
+        if time_limit is not None and not 0 <= time_limit < math.inf:
+            raise ValueError(f"A time limit is {time_limit}; it must be a number of seconds, at least 0.")
+        if time_limits.count(time_limit) > 1:
+            raise ValueError(f"The time limit {time_limit} is given twice.")
+
+
+def _refusals(solvers: Sequence[Solver], sources: Mapping[str, Instances]) -> dict[tuple[str, str], str]:
+    """
+    :param solvers: The solvers
+    :param sources: The sets of instances
+    :return: Why a solver cannot solve a set, by the names of set and solver
+    :raises ValueError: If no solver can solve anything
+    """
+    refusals = {}
+    for source, batch in sources.items():
         for solver in solvers:
             try:
                 solver.check(batch)
-            except ValueError as error:
-                raise ValueError(f"{source}: {solver.name} cannot solve these instances: {error}") from error
-    summary = []
-    with ExitStack() as stack:
-        log = _ResultLog(
-            stack.enter_context(replaced_when_complete(Path(out_dir) / RESULTS_FILE)),
-            stack.enter_context(replaced_when_complete(Path(out_dir) / SCHEDULES_FILE)),
+            except Exception as error:
+                # Of whatever kind: the others can do without it.
+                refusals[source, solver.name] = Failure.of(error).message
+    if len(refusals) == len(solvers) * len(sources):
+        raise ValueError(
+            " ".join(f"{source}: {solver} cannot solve these instances: {why}" for (source, solver), why in refusals.items())
         )
-        first_index = 0
-        for source, batch in sets.items():
-            batch = batch.to("cpu")
-            for solver in solvers:
-                if progress is not None:
-                    progress(f"{solver.name} on {source}: {len(batch)} instances")
-                summary.append(_evaluate_solver(solver, source, batch, first_index, seed, log))
-            first_index += len(batch)
-    return summary
+    return refusals
 
 
-class _ResultLog:
+class _SetEvaluation:
     """
-    The two files of an evaluation.
+    Evaluates solvers on one set of instances.
 
-    :param results: Opened ``results.csv``
-    :param schedules: Opened ``schedules.jsonl``
-    """
-
-    def __init__(self, results: TextIO, schedules: TextIO) -> None:
-        self._results = csv.writer(results, lineterminator="\n")
-        self._results.writerow(RESULT_COLUMNS)
-        self._schedules = schedules
-
-    def write(self, row: dict[str, Any], schedule: dict[str, Any]) -> None:
-        """
-        :param row: Value of every column of ``results.csv``; None becomes an empty cell
-        :param schedule: One line of ``schedules.jsonl``
-        """
-        self._results.writerow([row[column] for column in RESULT_COLUMNS])
-        self._schedules.write(json.dumps(schedule) + "\n")
-
-
-def _evaluate_solver(
-    solver: Solver, source: str, instances: Instances, first_index: int, seed: int, log: _ResultLog
-) -> SummaryRow:
-    """
-    :param solver: The solver
-    :param source: Name of the set of instances
-    :param instances: The set
+    :param source: Name of the set
+    :param instances: The set, on the CPU
     :param first_index: Index of its first instance in the files
-    :param seed: Seed of the solver
-    :param log: Where to write
-    :return: What the solver achieved
+    :param seed: Seed of the solvers
+    :param folder: Where results come from and go to
+    :param runner: Runs the solvers
+    :param progress: Called before each solver starts and after each of its instances
     """
-    results = solver.solve(instances, seed)
-    objectives, violations = [], []
-    for row, (n_tasks, result) in enumerate(zip(instances.task_mask.sum(1).tolist(), results, strict=True)):
+
+    def __init__(
+        self,
+        source: str,
+        instances: Instances,
+        first_index: int,
+        seed: int,
+        folder: EvaluationFolder,
+        runner: Runner,
+        progress: Progress | None,
+    ) -> None:
+        self.source = source
+        self.instances = instances
+        self.first_index = first_index
+        self.seed = seed
+        self.folder = folder
+        self.runner = runner
+        self.progress = progress
+        self._n_tasks = instances.task_mask.sum(1).tolist()
+        self._found: dict[tuple[str, float | None], list[ResultRow]] = {}
+
+    def rows(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
+        """
+        :param solver: A solver
+        :param time_limit: Seconds per instance, if the solver uses them
+        :param refusal: Why it cannot solve the set, if it cannot
+        :return: Its results on all instances: those that are there already, and those of now
+        """
+        time_limit = time_limit if solver.uses_time_limit else None
+        if (solver.name, time_limit) not in self._found:
+            self._found[solver.name, time_limit] = self._run(solver, time_limit, refusal)
+        return self._found[solver.name, time_limit]
+
+    def _run(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
+        """Find what :meth:`rows` returns."""
+        keys = [ResultKey(solver.name, self.first_index + row, time_limit, self.seed) for row in range(len(self.instances))]
+        missing = [
+            row for row, key in enumerate(keys) if key not in self.folder.rows or self.folder.rows[key].status == FAILED
+        ]
+        limit = "" if time_limit is None else f", {time_limit:g} s each"
+        text = f"{solver.name} on {self.source}: {len(keys)} instances{limit}"
+        if len(missing) < len(keys):
+            text += f", {len(keys) - len(missing)} of them done before"
+        n_done = len(keys) - len(missing)
+        if self.progress is not None:
+            self.progress(text, n_done, len(keys))
+        if refusal is not None:
+            for row in missing:
+                self._add(solver, row, time_limit, Failure(refusal))
+        else:
+            for row, result in self.runner.run(solver, self.instances, missing, time_limit, self.seed):
+                self._add(solver, row, time_limit, result)
+                n_done += 1
+                if self.progress is not None:
+                    self.progress(text, n_done, len(keys))
+        return [self.folder.rows[key] for key in keys]
+
+    def _add(self, solver: Solver, row: int, time_limit: float | None, result: SolverResult | Failure) -> None:
+        """
+        Check a result and write it down.
+
+        :param solver: Whose it is
+        :param row: Row of its instance in the set
+        :param time_limit: Seconds that the solver was given
+        :param result: What it found, or why it did not
+        """
         report: ScheduleReport | None = None
-        try:
-            report = check_schedule(instances, row, result.schedule)
-            objectives.append(report.objective)
-        except InfeasibleScheduleError as error:
-            violations.append(f"{solver.name}, instance {row} of {source}: {error}")
-        index = first_index + row
-        line = schedule_to_json(solver.name, index, result.schedule, report or ScheduleReport(math.nan, ()))
-        if report is None:
-            # JSON has no NaN.
-            line["objective"] = None
-        log.write(
-            {
-                "solver": solver.name,
-                "instance": index,
-                "n_uavs": instances.n_uavs,
-                "n_tasks": n_tasks,
-                "objective": None if report is None else report.objective,
-                "length": None if report is None else report.length,
-                "seconds": result.seconds,
-                "feasible": report is not None,
-            },
+        status, message = OK, ""
+        line: dict[str, Any] | None = None
+        if isinstance(result, Failure):
+            status, message = FAILED, result.message
+        else:
+            try:
+                report = check_schedule(self.instances, row, result.schedule)
+            except InfeasibleScheduleError as error:
+                status, message = INFEASIBLE, one_line(error)
+            index = self.first_index + row
+            line = schedule_to_json(solver.name, index, result.schedule, report or ScheduleReport(math.nan, ()))
+            if report is None:
+                # JSON has no NaN.
+                line["objective"] = None
+        solved = None if isinstance(result, Failure) else result
+        bound = None if solved is None or solved.bound is None or not math.isfinite(solved.bound) else float(solved.bound)
+        self.folder.add(
+            ResultRow(
+                solver=solver.name,
+                instance=self.first_index + row,
+                n_uavs=self.instances.n_uavs,
+                n_tasks=self._n_tasks[row],
+                objective=None if report is None else report.objective,
+                length=None if report is None else report.length,
+                seconds=None if solved is None else solved.seconds,
+                feasible=report is not None,
+                source=self.source,
+                time_limit=time_limit,
+                seed=self.seed,
+                batch_size=None if solved is None else solved.batch_size,
+                bound=bound,
+                status=status,
+                message=message,
+            ),
             line,
         )
-    n_feasible = len(objectives)
-    return SummaryRow(
-        solver=solver.name,
-        source=source,
-        n_instances=len(instances),
-        objective=float(np.mean(objectives)) if n_feasible > 0 else math.nan,
-        standard_error=float(np.std(objectives, ddof=1)) / math.sqrt(n_feasible) if n_feasible > 1 else math.nan,
-        seconds=math.fsum(result.seconds for result in results) / len(results),
-        batch_size=max(result.batch_size for result in results),
-        violations=tuple(violations),
-    )
-
-
-@contextmanager
-def replaced_when_complete(path: Path) -> Iterator[TextIO]:
-    """
-    Write a text file under a temporary name, which is renamed when the ``with`` block ends without an exception.
-
-    :param path: The file to write; its folder is created if missing
-    :raises ValueError: If it cannot be written there
-    """
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(temporary, "w", encoding="utf-8", newline="")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror}); choose another output folder.") from error
-    try:
-        with file:
-            yield file
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def require_rich() -> Any:
-    """
-    :return: The module ``rich`` with its tables
-    :raises ImportError: With the command that installs it
-    """
-    try:
-        import rich.console
-        import rich.table
-        import rich.text
-    except ImportError as error:
-        raise ImportError("Printing tables needs rich; run: pip install 'sb3-uav[solvers]'") from error
-    return rich
-
-
-def print_table(summary: Sequence[SummaryRow]) -> None:
-    """
-    Print a summary as a table on the standard output.
-
-    :param summary: What :func:`evaluate` returned
-    :raises ImportError: If rich is not installed
-    """
-    rich = require_rich()
-    console = rich.console.Console()
-    for source, rows in groupby(summary, key=lambda row: row.source):
-        table, n_instances = rich.table.Table(), 0
-        table.add_column("Solver", no_wrap=True)
-        # Short enough for a terminal of 80 columns.
-        for heading in ("Obj.", "Std.\nerror", "s per\ninstance", "Batch", "Infea-\nsible"):
-            table.add_column(heading, justify="right", no_wrap=True)
-        for row in rows:
-            n_instances = row.n_instances
-            table.add_row(
-                # Text, because rich would take brackets in a name for markup.
-                rich.text.Text(row.solver),
-                _figure(row.objective, 2),
-                _figure(row.standard_error, 2),
-                _figure(row.seconds, 4),
-                str(row.batch_size),
-                str(len(row.violations)),
-            )
-        table.title = rich.text.Text(f"{source}: {n_instances} instances")
-        if not console.is_terminal:
-            console.width = FILE_WIDTH
-        console.print(table)
-
-
-def _figure(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -9,7 +9,7 @@ from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import nearest_feasible
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.solvers.base import OneByOneSolver
+from sb3_uav.solvers.base import OneByOneSolver, Solution
 
 MAX_LLOYD_ITERATIONS = 100
 
@@ -28,9 +28,10 @@ class RandomNearest(OneByOneSolver):
     """Every task goes to a random UAV, every UAV to its nearest feasible task."""
 
     name = "random-nearest"
+    uses_time_limit = False
 
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
-        return nearest_feasible_schedule(instance, rng.integers(instance.n_uavs, size=instance.n_tasks))
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        return Solution(nearest_feasible_schedule(instance, rng.integers(instance.n_uavs, size=instance.n_tasks)))
 
 
 class KMeansNearest(OneByOneSolver):
@@ -42,15 +43,16 @@ class KMeansNearest(OneByOneSolver):
     """
 
     name = "kmeans-nearest"
+    uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
         if restarts < 1:
             raise ValueError(f"restarts of kmeans-nearest is {restarts}; K-means needs at least 1 start.")
         self.restarts = restarts
 
-    def solve_one(self, instance: Instances, rng: np.random.Generator) -> Schedule:
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
-        return nearest_feasible_schedule(instance, clusters)
+        return Solution(nearest_feasible_schedule(instance, clusters))
 
 
 def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restarts: int = 10) -> np.ndarray:

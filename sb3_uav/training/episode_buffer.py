@@ -30,9 +30,11 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
     """
     ``DictRolloutBuffer`` for PPO and A2C with the policies of this package.
 
-    An episode that ``n_steps`` cuts in two is stored as two fragments, each with its own copy of the static part; advantages
-    are SB3's. Samples differ from SB3's in their observations: static keys have one row per fragment of the minibatch, and
-    ``episode_index`` ``(batch,)`` int64 says which of them belongs to each step.
+    An episode that ``n_steps`` cuts in two is stored as two fragments, each with its own copy of the static part; so is one
+    whose static part a wrapper changes on the way, as ``VecNormalize`` does. Advantages are SB3's. Samples differ from those
+    of SB3 in their observations: static keys have one row per fragment of the minibatch, and ``episode_index`` ``(batch,)``
+    int64 says which of them belongs to each step. ``MultiInputPolicy`` does not know that key and stops with a ``KeyError``:
+    leave SB3's own buffer to it.
 
     :param buffer_size: Max number of element in the buffer
     :param observation_space: Observation space of one of our environments
@@ -46,6 +48,7 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
 
     _starts: np.ndarray
     _fragments: np.ndarray
+    _latest: dict[str, np.ndarray]
     _step_fields: ClassVar[tuple[str, ...]] = ("actions", "values", "log_probs", "advantages", "returns")
 
     def __init__(
@@ -94,12 +97,16 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
         :param log_prob: Log-probability of the action
         :param kwargs: What a parent class takes besides
         """
-        started = np.arange(self.n_envs) if self.pos == 0 else np.flatnonzero(episode_start)
+        if self.pos == 0:
+            self._latest = {key: np.array(obs[key], dtype=self.observation_space[key].dtype) for key in STATIC_KEYS}
+        changed = [(obs[key] != latest).any(axis=1) for key, latest in self._latest.items()]
+        started = np.flatnonzero(np.logical_or.reduce([episode_start, *changed]) | (self.pos == 0))
         if len(started) > 0:
             self._current[started] = self._n_fragments + np.arange(len(started))
             self._n_fragments += len(started)
             for key, rows in self._static.items():
-                rows.append(np.array(obs[key][started], dtype=self.observation_space[key].dtype))
+                self._latest[key][started] = obs[key][started]
+                rows.append(self._latest[key][started])
         self._fragments[self.pos] = self._current
         super().add(obs, action, reward, episode_start, value, log_prob, **kwargs)
 

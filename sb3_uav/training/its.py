@@ -73,6 +73,7 @@ class EpochRecord:
     :param n_instances: Instances trained on in this epoch
     :param objective: Mean return of its training episodes
     :param seconds: Wall time
+    :param generation_seconds: How much of it went into the router's instances, that is into allocating tasks
     """
 
     epoch: int
@@ -81,6 +82,7 @@ class EpochRecord:
     n_instances: int
     objective: float
     seconds: float
+    generation_seconds: float = 0.0
 
 
 class EpisodeStatistics(BaseCallback):
@@ -223,6 +225,7 @@ class ITSCallback(BaseCallback):
         self._router_env: BatchedVecEnv
         self._freezers: dict[str, Freezer] = {}
         self._statistics = EpisodeStatistics()
+        self._subsets: AllocatedSubsets | None = None
         self._started = False
         self._epoch_start = 0.0
         self._epoch_first_batch = 0
@@ -403,16 +406,15 @@ class ITSCallback(BaseCallback):
         else:
             # SB3's algorithms do not replay instances: new ones of the same distribution.
             first, n_batches, draw_batch = 0, self._batches_per_epoch(), self._draw_new_batch
-        self._router_env.set_generator(
-            AllocatedSubsets(
-                self.model.policy,
-                self.problem.generator,
-                draw_batch,
-                range(first, first + n_batches),
-                fraction,
-                lambda chunk: random_stream(self._seed(), SUBSET_STREAM, self.epoch, chunk),
-            )
+        self._subsets = AllocatedSubsets(
+            self.model.policy,
+            self.problem.generator,
+            draw_batch,
+            range(first, first + n_batches),
+            fraction,
+            lambda chunk: random_stream(self._seed(), SUBSET_STREAM, self.epoch, chunk),
         )
+        self._router_env.set_generator(self._subsets)
         self._freezers["allocator"].freeze()
         self._freezers["router"].thaw()
         try:
@@ -444,18 +446,24 @@ class ITSCallback(BaseCallback):
         """
         for index in range(first, n_epochs):
             start, number = time.time(), 1 + self._n_router_epochs()
+            generated_before = self._generation_seconds()
             statistics = EpisodeStatistics()
             with_bar, close_bar = self._progress(f"router, {phase} {index + 1}/{n_epochs}")
             try:
                 n_instances = self._learn_router(number, statistics, with_bar)
             finally:
                 close_bar()
-            self._record("router", number, phase, n_instances, statistics.mean_return, start)
+            generation = self._generation_seconds() - generated_before
+            self._record("router", number, phase, n_instances, statistics.mean_return, start, generation)
             if phase == "pre-training":
                 self._save_checkpoint()
             else:
                 self._save_router()
         self.router.policy.set_training_mode(False)
+
+    def _generation_seconds(self) -> float:
+        """How long it has taken to make the router's instances since the allocator's last epoch."""
+        return 0.0 if self._subsets is None else self._subsets.seconds
 
     def _learn_router(self, number: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
         """
@@ -501,8 +509,11 @@ class ITSCallback(BaseCallback):
 
     # ------------------------------------------------------------------------------------------------------ files
 
-    def _record(self, level: str, epoch: int, phase: str, n_instances: int, objective: float, start: float) -> None:
-        record = EpochRecord(epoch, level, phase, n_instances, objective, round(time.time() - start, 3))
+    def _record(
+        self, level: str, epoch: int, phase: str, n_instances: int, objective: float, start: float, generation: float = 0.0
+    ) -> None:
+        seconds, generation = round(time.time() - start, 3), round(generation, 3)
+        record = EpochRecord(epoch, level, phase, n_instances, objective, seconds, generation)
         self.records.append(record)
         self.logger.record(f"its/{level}_epoch", epoch)
         self.logger.record(f"its/{level}_objective", objective)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -53,6 +54,7 @@ class AllocatedSubsets:
     :param fraction: Part of the subsets to use, chosen at random
     :param stream: Random generator by number of the chunk
     :param shuffle_batches: Batches per chunk
+    :ivar seconds: How long it has taken so far to draw and allocate instances
     """
 
     n_uavs = 1
@@ -75,17 +77,21 @@ class AllocatedSubsets:
         self.fraction = fraction
         self.stream = stream
         self.shuffle_batches = shuffle_batches
+        self.seconds = 0.0
         self._next_batch = 0
         self._n_chunks = 0
         self._ready: Instances | None = None
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """The next ``batch_size`` subsets; ``rng`` is not used."""
+        start = time.perf_counter()
         while self._ready is None or len(self._ready) < batch_size:
             chunk = self._next_chunk()
             self._ready = chunk if self._ready is None else Instances.concatenate([self._ready, chunk])
         drawn, self._ready = self._ready[:batch_size], self._ready[batch_size:]
-        return drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+        drawn = drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+        self.seconds += time.perf_counter() - start
+        return drawn
 
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """

@@ -106,7 +106,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     row = int((instances.depot - 0.5).norm(dim=1).argmin())
     panels = []
     for solver in (sampling, heuristics[0]):
-        schedule = solver.solve(instances[row], seed)[0].schedule
+        schedule = solver.solve(instances[row], seed=seed)[0].schedule
         panels.append(MapPanel(instances, row, schedule, f"{solver.name}: {schedule.n_visited} tasks"))
     plot_schedules(panels, out / "schedule.png")
     files = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import gymnasium as gym
 import yaml
 
 try:
+    import optuna
     import rl_zoo3
     import rl_zoo3.train
     from rl_zoo3.exp_manager import ExperimentManager
@@ -20,14 +22,16 @@ except ImportError as error:
 
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_uav
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training import ITSCallback
+from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
 # Added to the seed of the training environments, whose rows take the seeds that follow it.
@@ -53,14 +57,20 @@ def register_algorithms() -> None:
     rl_zoo3.ALGOS.update(OUR_ALGORITHMS)
 
 
-def default_config(algo: str) -> Path | None:
+def default_config(algo: str, env_id: str | None = None) -> Path | None:
     """
     :param algo: Name of an algorithm
-    :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none
+    :param env_id: What to train on
+    :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none, or if rl_zoo3 has
+        one and ours does not know this environment
     """
     package = Path(sb3_uav.__file__).parent
     candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
-    return next((path for path in candidates if path.is_file()), None)
+    ours = next((path for path in candidates if path.is_file()), None)
+    theirs = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
+    if ours is not None and env_id is not None and theirs.is_file() and env_id not in yaml.safe_load(ours.read_text()):
+        return None
+    return ours
 
 
 def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:
@@ -83,16 +93,20 @@ class UAVExperimentManager(ExperimentManager):
     - ``env_kwargs`` of a YAML reach the evaluation environment too;
     - ``const_X`` is a constant, and numbers that YAML reads as strings (``1e-3``) are numbers;
     - a misspelled key is named, with the nearest known one;
-    - the evaluation environment is not seeded like the training environment, whose instances it would get.
+    - the evaluation environment is not seeded like the training environment, whose instances it would get;
+    - ``-optimize`` has search spaces that keep the network and whole episodes (:mod:`sb3_uav.zoo.tuning`), and prunes a trial
+      that diverges, however it does.
     """
 
-    # Whether the command line says how often to evaluate; if not, it is done once per epoch where there are epochs.
+    # Whether the command line says how often to evaluate; if not, FixedSetEvalCallback decides, and without it, it is done
+    # once per epoch where there are epochs.
     eval_freq_given = False
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
         if kwargs.get("vec_env_type", "dummy") == "dummy":
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
+        register_search_spaces(self.env_name.gym_id)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         try:
@@ -105,8 +119,6 @@ class UAVExperimentManager(ExperimentManager):
         return {key: plain_numbers(value) for key, value in hyperparams.items()}, saved
 
     def setup_experiment(self) -> Any:
-        if self.optimize_hyperparameters and self.algo in OUR_ALGORITHMS:
-            raise ValueError(f"-optimize has no search space for {self.algo} yet; tune ppo, or set the values by hand.")
         try:
             return super().setup_experiment()
         except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
@@ -125,10 +137,23 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self.config}: an argument of 'callback' does not fit: {error}") from error
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
-        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
-        if not self.eval_freq_given and self.eval_freq > 0 and n_tasks and "instances_per_epoch" in hyperparams:
-            self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
+        if not self.eval_freq_given:
+            self._choose_eval_freq(hyperparams, processed[2])
         return processed
+
+    def _choose_eval_freq(self, hyperparams: dict[str, Any], callbacks: list[BaseCallback]) -> None:
+        """
+        Evaluate as the YAML entry suggests.
+
+        :param hyperparams: Of the algorithm
+        :param callbacks: Those of the entry
+        """
+        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
+        if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
+            # It does what rl_zoo3's EvalCallback would do, on more than a few random episodes.
+            self.eval_freq = -1
+        elif n_tasks and "instances_per_epoch" in hyperparams:
+            self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
@@ -145,11 +170,44 @@ class UAVExperimentManager(ExperimentManager):
                 if self.continue_training and callback.resume_from is None:
                     callback.resume_from = find_checkpoint(Path(self.trained_agent))
 
+    def hyperparameters_optimization(self) -> None:
+        given = self.specified_callbacks or []
+        kept = [entry for entry in (given if isinstance(given, list) else [given]) if not is_fixed_set_evaluation(entry)]
+        # By name, so that every trial gets an instance of its own.
+        self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if "No trials are completed" not in str(error):
+                raise
+            raise ValueError("-optimize: all trials were pruned, there is no best one; allow more trials.") from error
+
+    def objective(self, trial: optuna.Trial) -> float:
+        try:
+            mean_reward = super().objective(trial)
+        except (RuntimeError, FloatingPointError) as error:
+            # rl_zoo3 takes ValueError and AssertionError in training for divergence; torch also raises these.
+            raise optuna.exceptions.TrialPruned(str(error)) from error
+        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
+            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+        if not math.isfinite(mean_reward):
+            raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
+        return mean_reward
+
     @property
     def its(self) -> ITSCallback | None:
         """The interactive training strategy of this run, if it has one."""
         found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
         return found[0] if found else None
+
+
+def is_fixed_set_evaluation(entry: Any) -> bool:
+    """
+    :param entry: Of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
+    :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which a trial has no use for
+    """
+    name = next(iter(entry)) if isinstance(entry, dict) else entry
+    return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
 
 
 def find_checkpoint(trained_agent: Path) -> Path:

@@ -13,7 +13,7 @@ import sb3_uav  # noqa: F401  (registers the environment ids)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Train with rl_zoo3; every flag of ``rl_zoo3.train`` works, but for ``-optimize`` with our own algorithms.
+    Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works.
 
     :param argv: Command line arguments; those of the process when None
     :return: Exit code
@@ -35,6 +35,7 @@ def _train(arguments: list[str]) -> int:
     register_algorithms()
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="reinforce")
+    parser.add_argument("--env")
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("--eval-freq")
     parser.add_argument("-i", "--trained-agent")
@@ -43,7 +44,7 @@ def _train(arguments: list[str]) -> int:
         raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
     defaults = []
-    if known.conf_file is None and (config := default_config(known.algo)) is not None:
+    if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
     # rl_zoo3.train.train makes its manager by this name, reads sys.argv and takes no arguments.
     with (

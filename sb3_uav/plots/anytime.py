@@ -1,0 +1,206 @@
+"""Objective against time, all solvers in one panel, from an evaluation at several time limits."""
+
+from __future__ import annotations
+
+import math
+import os
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_uav.envs.render import UAV_COLOURS, require_matplotlib
+from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+from sb3_uav.solvers.comparison import confidence_halfwidth
+from sb3_uav.solvers.results import OK, RESULTS_FILE, ResultRow, read_results
+
+PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+LEGEND_WIDTH = 34
+FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
+
+
+class Curve(NamedTuple):
+    """
+    What one solver found in one set of instances.
+
+    :param solver: Name of the solver
+    :param seconds: ``(n_points,)``, mean wall time per instance, in ascending order
+    :param objective: ``(n_points,)``, mean objective
+    :param halfwidth: ``(n_points,)``, half of its confidence interval
+    :param batch_size: How many instances were solved at once
+    """
+
+    solver: str
+    seconds: np.ndarray
+    objective: np.ndarray
+    halfwidth: np.ndarray
+    batch_size: int
+
+
+class Panel(NamedTuple):
+    """
+    :param source: Name of the set of instances
+    :param n_instances: Number of instances
+    :param curves: One per solver
+    :param left_out: Solvers, with their time limits, that did not solve all instances
+    """
+
+    source: str
+    n_instances: int
+    curves: list[Curve]
+    left_out: list[str]
+
+
+def plot_anytime(
+    results: str | os.PathLike[str],
+    paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    solvers: Sequence[str] | None = None,
+) -> list[Path]:
+    """
+    Draw the mean objective of every solver against its mean wall time, a panel for each set of instances.
+
+    A solver that ran with several time limits is a curve: each of its points is a run of its own, at the time that it really
+    took. One that ran with one or none is a point, and a dashed line to the right of it. Of several seeds the mean is drawn.
+    Bands and bars are 95 % confidence intervals over the instances of what is missing to the best objective that any solver
+    found on the same instance: that some instances allow more than others says nothing about solvers.
+
+    :param results: Folder that :func:`~sb3_uav.solvers.evaluation.evaluate` wrote
+    :param paths: The ``.png``, ``.pdf`` or ``.svg`` to write, or several
+    :param solvers: Names of the solvers to draw; all when None
+    :return: The paths
+    :raises FileNotFoundError: If there is no ``results.csv`` in the folder
+    :raises ValueError: If it holds nothing to draw or is damaged, a suffix is not allowed, or a solver is unknown
+    :raises ImportError: If matplotlib is not installed
+    """
+    checked = [checked_path(path) for path in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
+    file = Path(results) / RESULTS_FILE
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file; give the folder that `sb3-uav evaluate` wrote.")
+    rows = read_results(file)
+    known = _unique(row.solver for row in rows)
+    for solver in solvers or ():
+        if solver not in known:
+            raise ValueError(f"{file}: has no results of {solver!r}; choose some of {known}.")
+    panels = anytime_panels([row for row in rows if solvers is None or row.solver in solvers])
+    if not any(panel.curves for panel in panels):
+        raise ValueError(f"{file}: no solver has solved all instances of a set; there is nothing to draw.")
+    numbers = {solver: number for number, solver in enumerate(known)}
+    figure = new_figure(PANEL_WIDTH, PANEL_HEIGHT * len(panels))
+    for axes, panel in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
+        _draw_panel(axes, panel, numbers)
+    figure.supxlabel(FOOTNOTE, fontsize=7.5, color="0.4")
+    for path in checked:
+        save_figure(figure, path)
+    return checked
+
+
+def anytime_panels(rows: Sequence[ResultRow]) -> list[Panel]:
+    """
+    :param rows: Results of an evaluation
+    :return: What to draw, in the order of the results
+    """
+    return [_panel([row for row in rows if row.source == source]) for source in _unique(row.source for row in rows)]
+
+
+def _panel(rows: Sequence[ResultRow]) -> Panel:
+    """
+    :param rows: Results of one set of instances
+    :return: Its panel
+    """
+    instances = sorted({row.instance for row in rows})
+    runs: dict[tuple[str, float | None], list[ResultRow]] = {}
+    for row in rows:
+        runs.setdefault((row.solver, row.time_limit), []).append(row)
+    objectives: dict[tuple[str, float | None], np.ndarray] = {}
+    limits: dict[str, list[str]] = {}
+    for (solver, time_limit), found in runs.items():
+        if {row.instance for row in found if row.status == OK} == set(instances):
+            objectives[solver, time_limit] = _per_instance(found, instances)
+        else:
+            limits.setdefault(solver, []).extend([] if time_limit is None else [f"{time_limit:g} s"])
+    left_out = [f"{solver} ({', '.join(given)})" if given else solver for solver, given in limits.items()]
+    best = np.max(list(objectives.values()), axis=0) if objectives else np.zeros(len(instances))
+    curves = []
+    for solver in _unique(solver for solver, _ in objectives):
+        keys = [key for key in objectives if key[0] == solver]
+        points = sorted(
+            (_mean_seconds(runs[key]), float(objectives[key].mean()), confidence_halfwidth(best - objectives[key]))
+            for key in keys
+        )
+        if len({objectives[key].tobytes() for key in keys}) == 1:
+            # Time limits made no difference: it uses none.
+            points = points[:1]
+        seconds, objective, halfwidth = np.array(points).T
+        batch_size = max(row.batch_size or 1 for key in keys for row in runs[key])
+        curves.append(Curve(solver, seconds, objective, halfwidth, batch_size))
+    return Panel(rows[0].source, len(instances), curves, left_out)
+
+
+def _per_instance(rows: Sequence[ResultRow], instances: Sequence[int]) -> np.ndarray:
+    """Objective of every instance, ``(n_instances,)``; the mean over the seeds."""
+    found: dict[int, list[float]] = {instance: [] for instance in instances}
+    for row in rows:
+        if row.objective is not None:
+            found[row.instance].append(row.objective)
+    return np.array([math.fsum(values) / len(values) for values in found.values()])
+
+
+def _mean_seconds(rows: Sequence[ResultRow]) -> float:
+    seconds = [row.seconds for row in rows if row.status == OK and row.seconds is not None]
+    return math.fsum(seconds) / len(seconds)
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))
+
+
+def _look(number: int) -> dict[str, str]:
+    """Colour and marker of a solver; those after the eighth have the same colours, but other markers with them."""
+    n_colours = len(UAV_COLOURS)
+    return {"color": UAV_COLOURS[number % n_colours], "marker": MARKERS[(number + number // n_colours) % len(MARKERS)]}
+
+
+def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
+    """
+    :param axes: matplotlib axes
+    :param panel: What to draw
+    :param numbers: Number of every solver, which decides on its look
+    """
+    ticker = require_matplotlib().ticker
+    axes.set_title(f"{panel.source}: {panel.n_instances} instances", fontsize=11, loc="left")
+    axes.set_xscale("log")
+    axes.set_xlabel("seconds per instance (mean)")
+    axes.set_ylabel("objective (mean)")
+    axes.grid(color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    times = np.concatenate([curve.seconds for curve in panel.curves]) if panel.curves else np.ones(1)
+    # A point needs room on both sides, and a line to lead somewhere.
+    axes.set_xlim(times.min() / 2, times.max() * 2)
+    # Of few decades, their halves are worth a label too.
+    few = times.max() < 100 * times.min()
+    axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+    axes.xaxis.set_minor_formatter(ticker.NullFormatter())
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda seconds, _: f"{seconds:g}"))
+    # The legend reads from the best down, as the panel does.
+    for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
+        look = _look(numbers[curve.solver])
+        name = textwrap.fill(curve.solver.replace(",", ", "), LEGEND_WIDTH, break_on_hyphens=False)
+        label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
+        low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth
+        if len(curve.seconds) > 1:
+            axes.plot(curve.seconds, curve.objective, **look, linewidth=1.6, markersize=5, label=label)
+            axes.fill_between(curve.seconds, low, high, color=look["color"], alpha=0.15, linewidth=0)
+        else:
+            until = axes.get_xlim()[1]
+            axes.plot(curve.seconds, curve.objective, **look, linestyle="none", markersize=6, label=label)
+            axes.hlines(curve.objective, curve.seconds, until, color=look["color"], linestyle=(0, (4, 3)), linewidth=1.2)
+            axes.vlines(curve.seconds, low, high, color=look["color"], linewidth=1.2)
+    if panel.curves:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5, frameon=False, borderaxespad=0.0)
+    if panel.left_out:
+        text = textwrap.fill(f"Did not solve all instances: {'; '.join(panel.left_out)}", 100)
+        axes.text(0.0, -0.16, text, transform=axes.transAxes, fontsize=7.5, color="0.4", va="top")

@@ -1,0 +1,947 @@
+"""
+The compiled part of local search: plain loops over arrays, without the GIL.
+
+All of it stands in one file because numba's cache on disk notices changes of a function's own file only. The first call
+after an installation compiles, which takes a while; later processes load the result from ``__pycache__``.
+
+Nodes are numbered from 0, the depot, to ``n_tasks``. A *place* in a tour is the position that a new task would take there.
+Sums of legs are added up again from scratch whenever a tour has been changed for good, so rounding errors never pile up.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+try:
+    from numba import njit
+except ImportError as error:
+    raise ImportError("Local search needs numba; run: pip install 'sb3-uav[solvers]'") from error
+
+# Changes of a tour's length below this are rounding errors; tours are at most 1 long.
+EPSILON = 1e-12
+# Values of schedules that differ by less count as equal while annealing; task values are at most 1.
+SAME_VALUE = 1e-9
+# What no insertion costs.
+NOWHERE = 1e300
+# The longest chain of tasks that moves as one.
+MAX_SEGMENT = 3
+
+
+# What is known of a node: where it is and what it is worth; by whom it is visited, -1 if by none, and as which stop; whether
+# it waits in the queue; and, as a candidate for insertion, the trial that saw it last, the factor on its worth (below 0 to
+# leave it out), what its cheapest insertion adds to which tour, and after which node.
+NODE = np.dtype(
+    [
+        ("x", np.float64),
+        ("y", np.float64),
+        ("value", np.float64),
+        ("owner", np.int32),
+        ("position", np.int32),
+        ("seen", np.int64),
+        ("cost", np.float64),
+        ("tour", np.int32),
+        ("after", np.int32),
+        ("noise", np.float32),
+        ("queued", np.int32),
+    ],
+    align=True,
+)
+# Number of tasks and length of a tour, now and when the current trial changed it first.
+TOUR = np.dtype(
+    [
+        ("size", np.int64),
+        ("length", np.float64),
+        ("old_size", np.int64),
+        ("old_length", np.float64),
+        ("touched", np.int64),
+    ],
+    align=True,
+)
+# The longest feasible tour, the number of trials so far, and the state of the random numbers.
+STATE = np.dtype([("limit", np.float64), ("clock", np.int64), ("random", np.uint64)], align=True)
+# Rows of Plan.lists.
+QUEUE, REMOVED, CANDIDATES, TOUCHED = range(4)
+
+
+class AnnealingSettings(NamedTuple):
+    """
+    How ruin and recreate works.
+
+    :param mean_removed: How many tasks a trial takes out, on average
+    :param longest_string: How many tasks at most it takes out of one tour
+    :param n_near: Beside how many neighbours a task may be inserted
+    :param blink: Probability that a trial overlooks a task
+    :param noise: By how much the worth of an insertion may be misjudged, as a fraction of it
+    :param thrift: What a shorter tour is worth: that part of the value now collected on the same length
+    :param hot: Temperature at the start, in mean task values
+    :param cold: Temperature at the end
+    """
+
+    mean_removed: float = 10.0
+    longest_string: float = 10.0
+    n_near: int = 16
+    blink: float = 0.01
+    noise: float = 0.2
+    thrift: float = 0.3
+    hot: float = 2.0
+    cold: float = 0.02
+
+
+class Plan(NamedTuple):
+    """
+    A schedule that is being changed, its instance, and the memory that takes.
+
+    Records, because every array that is passed to a function costs time.
+
+    :param nodes: ``(n_tasks + 1,)`` of :data:`NODE`, the depot first
+    :param near: ``(n_tasks + 1, n_near)`` int32, for every node the nearest tasks, nearest first
+    :param routes: ``(2 * n_uavs, n_tasks + 2)`` int64: of every UAV the depot, its tasks in flying order, the depot; copies
+    :param tours: ``(n_uavs,)`` of :data:`TOUR`
+    :param lists: ``(4, n_tasks + n_uavs + 1)`` int64, lists of nodes or tours
+    :param state: ``(1,)`` of :data:`STATE`
+    """
+
+    nodes: np.ndarray
+    near: np.ndarray
+    routes: np.ndarray
+    tours: np.ndarray
+    lists: np.ndarray
+    state: np.ndarray
+
+
+# ------------------------------------------------------------------------------------------------------------- plain pieces
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def distance(plan, a, b):
+    dx = plan.nodes[a].x - plan.nodes[b].x
+    dy = plan.nodes[a].y - plan.nodes[b].y
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def uniform(plan):
+    """xorshift64*: the next random number in [0, 1)."""
+    state = plan.state[0].random
+    state ^= state >> np.uint64(12)
+    state ^= state << np.uint64(25)
+    state ^= state >> np.uint64(27)
+    plan.state[0].random = state
+    return ((state * np.uint64(2685821657736338717)) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True, nogil=True)
+def measure(plan, v):
+    """Add up the legs of tour ``v`` and renumber its tasks."""
+    route = plan.routes[v]
+    length = 0.0
+    for p in range(1, plan.tours[v].size + 1):
+        plan.nodes[route[p]].owner = v
+        plan.nodes[route[p]].position = p
+        length += distance(plan, route[p - 1], route[p])
+    plan.tours[v].length = length + distance(plan, route[plan.tours[v].size], 0)
+
+
+@njit(cache=True, nogil=True)
+def measure_all(plan):
+    """Find out from the routes who visits what, and how long the tours are."""
+    for task in range(len(plan.nodes)):
+        plan.nodes[task].owner = -1
+    for v in range(len(plan.tours)):
+        measure(plan, v)
+
+
+@njit(cache=True, nogil=True)
+def total_value(plan):
+    total = 0.0
+    for task in range(1, len(plan.nodes)):
+        if plan.nodes[task].owner >= 0:
+            total += plan.nodes[task].value
+    return total
+
+
+@njit(cache=True, nogil=True)
+def count_visited(plan):
+    total = 0
+    for v in range(len(plan.tours)):
+        total += plan.tours[v].size
+    return total
+
+
+@njit(cache=True, nogil=True)
+def total_length(plan):
+    total = 0.0
+    for v in range(len(plan.tours)):
+        total += plan.tours[v].length
+    return total
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def insert(plan, v, place, task, added):
+    """Put ``task`` at ``place`` of tour ``v``, which grows by ``added``."""
+    route = plan.routes[v]
+    for p in range(plan.tours[v].size + 1, place - 1, -1):
+        route[p + 1] = route[p]
+        plan.nodes[route[p]].position = p + 1
+    route[place] = task
+    plan.nodes[task].owner = v
+    plan.nodes[task].position = place
+    plan.tours[v].size += 1
+    plan.tours[v].length += added
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def cut(plan, v, first, count):
+    """Take ``count`` tasks, from position ``first`` on, out of tour ``v``; its length is left as it was."""
+    route = plan.routes[v]
+    for p in range(first, first + count):
+        plan.nodes[route[p]].owner = -1
+    for p in range(first + count, plan.tours[v].size + 2):
+        route[p - count] = route[p]
+        plan.nodes[route[p]].position = p - count
+    plan.tours[v].size -= count
+
+
+@njit(cache=True, nogil=True)
+def reverse(plan, v, first, last):
+    """Turn round the positions ``first`` to ``last`` of tour ``v``."""
+    route = plan.routes[v]
+    while first <= last:
+        a, b = route[first], route[last]
+        route[first], route[last] = b, a
+        plan.nodes[b].position = first
+        plan.nodes[a].position = last
+        first += 1
+        last -= 1
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def push(plan, n_queued, node):
+    """Queue a node unless it is the depot or waits already; returns the new length of the queue."""
+    if node == 0 or plan.nodes[node].queued:
+        return n_queued
+    plan.nodes[node].queued = True
+    plan.lists[QUEUE, n_queued] = node
+    return n_queued + 1
+
+
+@njit(cache=True, nogil=True)
+def find_near(nodes, near):
+    """
+    Fill in the nearest tasks of every node, nearest first; of several as near, those with the smallest numbers.
+
+    :param nodes: As in :class:`Plan`
+    :param near: As in :class:`Plan`, to be filled
+    """
+    n_near = near.shape[1]
+    squares = np.empty(n_near)
+    for a in range(len(nodes)):
+        count = 0
+        for b in range(1, len(nodes)):
+            dx, dy = nodes[a].x - nodes[b].x, nodes[a].y - nodes[b].y
+            square = dx * dx + dy * dy
+            if b == a or (count == n_near and (n_near == 0 or square >= squares[n_near - 1])):
+                continue
+            k = count if count < n_near else n_near - 1
+            while k > 0 and squares[k - 1] > square:
+                squares[k] = squares[k - 1]
+                near[a, k] = near[a, k - 1]
+                k -= 1
+            squares[k] = square
+            near[a, k] = b
+            count = min(count + 1, n_near)
+
+
+# ------------------------------------------------------------------------------------------------------------ shorter tours
+
+
+@njit(cache=True, nogil=True)
+def move_segment(plan, v, first, count, w, place, flip):
+    """
+    Move up to three neighbouring tasks of tour ``v`` to ``place`` of tour ``w`` (as numbered before), turned if ``flip``.
+    """
+    route = plan.routes[v]
+    a, b, c = route[first], route[first + 1], route[min(first + 2, plan.tours[v].size + 1)]
+    cut(plan, v, first, count)
+    if w == v and place > first:
+        place -= count
+    for i in range(count):
+        k = i if flip else count - 1 - i
+        insert(plan, w, place, a if k == 0 else b if k == 1 else c, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def survey_segments(plan, a, saved):
+    """
+    :param saved: ``(2 * MAX_SEGMENT,)`` float64, to be filled with what is saved by taking out the tasks from ``a`` forwards,
+        one to three, and backwards; 0 where a tour ends before
+    :return: The largest
+    """
+    v, p = plan.nodes[a].owner, plan.nodes[a].position
+    size = plan.tours[v].size
+    most = 0.0
+    for k in range(2 * MAX_SEGMENT):
+        first = p if k < MAX_SEGMENT else p - k + MAX_SEGMENT
+        last = p + k if k < MAX_SEGMENT else p
+        saved[k] = 0.0
+        if first >= 1 and last <= size:
+            before, behind = plan.routes[v, first - 1], plan.routes[v, last + 1]
+            saved[k] = distance(plan, before, plan.routes[v, first]) - distance(plan, before, behind)
+            saved[k] += distance(plan, plan.routes[v, last], behind)
+            most = max(most, saved[k])
+    return most
+
+
+@njit(cache=True, nogil=True)
+def try_segments(plan, n_queued, a, b, distance_ab, at_start, saved):
+    """
+    Or-opt and relocation: move one to three tasks, ``a`` at one end, next to ``b``, if that makes the tours shorter.
+
+    :param b: A visited task, or the depot, which means that of ``a``'s own tour
+    :param at_start: Which depot is meant: that at the start of the tour, or that at its end
+    :param saved: See :func:`survey_segments`
+    :return: The new length of the queue, -1 if nothing has changed
+    """
+    v = plan.nodes[a].owner
+    w = v if b == 0 else plan.nodes[b].owner
+    p = plan.nodes[a].position
+    q = plan.nodes[b].position if b > 0 else 0 if at_start else plan.tours[v].size + 1
+    for k in range(2 * MAX_SEGMENT):
+        if saved[k] <= distance_ab:
+            continue
+        forward = k < MAX_SEGMENT
+        first = p if forward else p - k + MAX_SEGMENT
+        last = p + k if forward else p
+        if w == v and first <= q <= last:
+            continue
+        end = plan.routes[v, last] if forward else plan.routes[v, first]
+        for after_b in (True, False):
+            if (q > plan.tours[w].size) if after_b else (q == 0):
+                continue
+            place = q + 1 if after_b else q
+            if w == v and first <= place <= last + 1:
+                continue
+            c = plan.routes[w, q + 1] if after_b else plan.routes[w, q - 1]
+            added = distance_ab + distance(plan, end, c) - distance(plan, b, c)
+            if added - saved[k] >= -EPSILON:
+                continue
+            inside = 0.0
+            if w != v:
+                for r in range(first, last):
+                    inside += distance(plan, plan.routes[v, r], plan.routes[v, r + 1])
+                if plan.tours[w].length + added + inside > plan.state[0].limit:
+                    continue
+            before, behind = plan.routes[v, first - 1], plan.routes[v, last + 1]
+            plan.tours[v].length -= saved[k] + inside
+            plan.tours[w].length += added + inside
+            move_segment(plan, v, first, last - first + 1, w, place, forward != after_b)
+            for node in (a, b, end, c, before, behind):
+                n_queued = push(plan, n_queued, node)
+            return n_queued
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def try_two_opt(plan, n_queued, a, b, distance_ab):
+    """2-opt within one tour: join ``a`` and ``b``, turn round what lies between. Parameters as of :func:`try_segments`."""
+    v = plan.nodes[a].owner
+    p = plan.nodes[a].position
+    route = plan.routes[v]
+    for forward in (True, False):
+        q = plan.nodes[b].position if b > 0 else 0 if forward else plan.tours[v].size + 1
+        # The neighbours on the side of the legs that vanish.
+        next_a = route[p + 1] if forward else route[p - 1]
+        next_b = route[q + 1] if forward else route[q - 1]
+        if next_a == b or next_b == a:
+            continue
+        change = distance_ab + distance(plan, next_a, next_b) - distance(plan, a, next_a) - distance(plan, b, next_b)
+        if change >= -EPSILON:
+            continue
+        if forward:
+            reverse(plan, v, min(p, q) + 1, max(p, q))
+        else:
+            reverse(plan, v, min(p, q), max(p, q) - 1)
+        plan.tours[v].length += change
+        for node in (a, b, next_a, next_b):
+            n_queued = push(plan, n_queued, node)
+        return n_queued
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def try_exchange(plan, n_queued, a, b, distance_ab):
+    """Swap ``a`` with a neighbour of ``b`` in another tour. Parameters as of :func:`try_segments`."""
+    v, w = plan.nodes[a].owner, plan.nodes[b].owner
+    p = plan.nodes[a].position
+    before, behind = plan.routes[v, p - 1], plan.routes[v, p + 1]
+    old = distance(plan, before, a) + distance(plan, a, behind)
+    for side in (1, -1):
+        q = plan.nodes[b].position + side
+        c = plan.routes[w, q]
+        if c == 0:
+            continue
+        beyond = plan.routes[w, q + side]
+        change_w = distance_ab + distance(plan, a, beyond) - distance(plan, b, c) - distance(plan, c, beyond)
+        change_v = distance(plan, before, c) + distance(plan, c, behind) - old
+        if change_v + change_w >= -EPSILON:
+            continue
+        if plan.tours[v].length + change_v > plan.state[0].limit or plan.tours[w].length + change_w > plan.state[0].limit:
+            continue
+        plan.routes[v, p], plan.routes[w, q] = c, a
+        plan.nodes[a].owner, plan.nodes[c].owner = w, v
+        plan.nodes[a].position, plan.nodes[c].position = q, p
+        plan.tours[v].length += change_v
+        plan.tours[w].length += change_w
+        for node in (a, b, c, before, behind, beyond):
+            n_queued = push(plan, n_queued, node)
+        return n_queued
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def head_length(plan, v, p):
+    """Length of tour ``v`` from its start to position ``p``."""
+    length = 0.0
+    for k in range(p):
+        length += distance(plan, plan.routes[v, k], plan.routes[v, k + 1])
+    return length
+
+
+@njit(cache=True, nogil=True)
+def try_crossing(plan, n_queued, a, b, distance_ab):
+    """2-opt*: join two tours at ``a`` and ``b``, and what is left of them. Parameters as of :func:`try_segments`."""
+    v, w = plan.nodes[a].owner, plan.nodes[b].owner
+    for variant in range(3):
+        p, q = plan.nodes[a].position, plan.nodes[b].position
+        # Positions of the last stop before the leg that vanishes, in either tour.
+        if variant == 0:
+            q -= 1
+        elif variant == 2:
+            p -= 1
+            q -= 1
+        route_v, route_w = plan.routes[v], plan.routes[w]
+        end_v, start_v, end_w, start_w = route_v[p], route_v[p + 1], route_w[q], route_w[q + 1]
+        change = -distance(plan, end_v, start_v) - distance(plan, end_w, start_w)
+        # Heads are joined to tails, or heads to heads and tails to tails.
+        if variant == 0:
+            change += distance_ab + distance(plan, end_w, start_v)
+        elif variant == 1:
+            change += distance_ab + distance(plan, start_v, start_w)
+        else:
+            change += distance_ab + distance(plan, end_v, end_w)
+        if change >= -EPSILON:
+            continue
+        head_v, head_w = head_length(plan, v, p), head_length(plan, w, q)
+        tail_v = plan.tours[v].length - head_v - distance(plan, end_v, start_v)
+        tail_w = plan.tours[w].length - head_w - distance(plan, end_w, start_w)
+        if variant == 0:
+            new_v = head_v + tail_w + distance(plan, end_v, start_w)
+            new_w = head_w + tail_v + distance(plan, end_w, start_v)
+        else:
+            new_v = head_v + head_w + distance(plan, end_v, end_w)
+            new_w = tail_v + tail_w + distance(plan, start_v, start_w)
+        if new_v > plan.state[0].limit or new_w > plan.state[0].limit:
+            continue
+        size_v, size_w = plan.tours[v].size, plan.tours[w].size
+        old_v, old_w = route_v[: size_v + 2].copy(), route_w[: size_w + 2].copy()
+        if variant == 0:
+            plan.tours[v].size = p + size_w - q
+            plan.tours[w].size = q + size_v - p
+            route_v[p + 1 : plan.tours[v].size + 2] = old_w[q + 1 :]
+            route_w[q + 1 : plan.tours[w].size + 2] = old_v[p + 1 :]
+        else:
+            plan.tours[v].size = p + q
+            plan.tours[w].size = size_v - p + size_w - q
+            route_v[p + 1 : p + q + 2] = old_w[q::-1]
+            route_w[: size_v - p + 1] = old_v[:p:-1]
+            route_w[size_v - p + 1 : plan.tours[w].size + 2] = old_w[q + 1 :]
+        measure(plan, v)
+        measure(plan, w)
+        for node in (end_v, start_v, end_w, start_w):
+            n_queued = push(plan, n_queued, node)
+        return n_queued
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def shorten(plan, n_queued, n_near):
+    """
+    Make tours shorter around the tasks in the queue until nothing changes there.
+
+    :param n_near: How many neighbours of a task to try
+    :return: Whether anything has changed
+    """
+    changed = False
+    n_near = min(n_near, plan.near.shape[1])
+    saved = np.empty(2 * MAX_SEGMENT)
+    while n_queued > 0:
+        n_queued -= 1
+        a = plan.lists[QUEUE, n_queued]
+        plan.nodes[a].queued = False
+        improved = plan.nodes[a].owner >= 0
+        while improved:
+            improved = False
+            v, p = plan.nodes[a].owner, plan.nodes[a].position
+            longest = max(distance(plan, plan.routes[v, p - 1], a), distance(plan, a, plan.routes[v, p + 1]))
+            longest = max(longest, survey_segments(plan, a, saved))
+            for j in range(-2, n_near):
+                b = 0 if j < 0 else np.int64(plan.near[a, j])
+                distance_ab = distance(plan, a, b)
+                if distance_ab >= longest:
+                    if j < 0:
+                        continue
+                    break
+                if j >= 0 and plan.nodes[b].owner < 0:
+                    continue
+                n = -1
+                if j < 0 or plan.nodes[b].owner == v:
+                    n = try_two_opt(plan, n_queued, a, b, distance_ab) if j != -1 else -1
+                if n < 0:
+                    n = try_segments(plan, n_queued, a, b, distance_ab, j == -2, saved)
+                if n < 0 and j >= 0 and plan.nodes[b].owner != v:
+                    n = try_exchange(plan, n_queued, a, b, distance_ab)
+                    if n < 0:
+                        n = try_crossing(plan, n_queued, a, b, distance_ab)
+                if n >= 0:
+                    n_queued = n
+                    improved = changed = True
+                    break
+    return changed
+
+
+# -------------------------------------------------------------------------------------------------------------- more tasks
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def offer(plan, task, v, a, b):
+    """Note that ``task`` fits between ``a`` and ``b`` of tour ``v``, if it does so cheaper than anywhere before."""
+    offer_at(plan, task, v, a, distance(plan, a, task) + distance(plan, task, b) - distance(plan, a, b))
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def offer_at(plan, task, v, a, added):
+    """The same, for those who know already what it adds to the tour."""
+    if added < plan.nodes[task].cost and plan.tours[v].length + added <= plan.state[0].limit:
+        plan.nodes[task].cost = added
+        plan.nodes[task].tour = v
+        plan.nodes[task].after = a
+
+
+@njit(cache=True, nogil=True)
+def look_everywhere(plan, task):
+    """Find the cheapest place of a task in all tours."""
+    plan.nodes[task].cost = NOWHERE
+    plan.nodes[task].tour = -1
+    for v in range(len(plan.tours)):
+        for p in range(plan.tours[v].size + 1):
+            offer(plan, task, v, plan.routes[v, p], plan.routes[v, p + 1])
+
+
+@njit(cache=True, nogil=True)
+def look_around(plan, task, n_near):
+    """Find the cheapest place of a task beside its ``n_near`` neighbours and the depot; everywhere if that is None."""
+    if n_near == 0:
+        look_everywhere(plan, task)
+        return
+    plan.nodes[task].cost = NOWHERE
+    plan.nodes[task].tour = -1
+    for j in range(n_near):
+        a = np.int64(plan.near[task, j])
+        v = plan.nodes[a].owner
+        if v >= 0:
+            p = plan.nodes[a].position
+            offer(plan, task, v, plan.routes[v, p - 1], a)
+            offer(plan, task, v, a, plan.routes[v, p + 1])
+    for v in range(len(plan.tours)):
+        offer(plan, task, v, 0, plan.routes[v, 1])
+        offer(plan, task, v, plan.routes[v, plan.tours[v].size], 0)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def keep(plan, n_touched, v):
+    """Copy tour ``v``, unless it has been copied in this trial already; returns the number of copied tours."""
+    if plan.tours[v].touched == plan.state[0].clock:
+        return n_touched
+    plan.tours[v].touched = plan.state[0].clock
+    plan.lists[TOUCHED, n_touched] = v
+    size = plan.tours[v].size
+    plan.routes[len(plan.tours) + v, : size + 2] = plan.routes[v, : size + 2]
+    plan.tours[v].old_size = size
+    plan.tours[v].old_length = plan.tours[v].length
+    return n_touched + 1
+
+
+@njit(cache=True, nogil=True)
+def put_back(plan, n_touched):
+    """Undo the trial."""
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        for p in range(1, plan.tours[v].size + 1):
+            plan.nodes[plan.routes[v, p]].owner = -1
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        size = plan.tours[v].old_size
+        plan.routes[v, : size + 2] = plan.routes[len(plan.tours) + v, : size + 2]
+        plan.tours[v].size = size
+        for p in range(1, size + 1):
+            plan.nodes[plan.routes[v, p]].owner = v
+            plan.nodes[plan.routes[v, p]].position = p
+        plan.tours[v].length = plan.tours[v].old_length
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def enter(plan, n_candidates, task, blink, spread):
+    """Make a task a candidate, unless it is one or has been left out already; returns the number of candidates."""
+    if plan.nodes[task].seen == plan.state[0].clock:
+        return n_candidates
+    plan.nodes[task].seen = plan.state[0].clock
+    plan.nodes[task].cost = NOWHERE
+    plan.nodes[task].tour = -1
+    plan.nodes[task].noise = 1.0
+    if blink > 0.0 and uniform(plan) < blink:
+        plan.nodes[task].noise = -1.0
+        return n_candidates
+    if spread > 0.0:
+        plan.nodes[task].noise += spread * (2.0 * uniform(plan) - 1.0)
+    plan.lists[CANDIDATES, n_candidates] = task
+    return n_candidates + 1
+
+
+@njit(cache=True, nogil=True)
+def fill(plan, n_candidates, n_touched, n_near, blink, spread):
+    """
+    Insert candidates, the one that is worth most per added length first, until none fits.
+
+    :param n_near: How many neighbours of a task to look at; 0 for all
+    :param blink: Probability of leaving a new candidate out
+    :param spread: Standard noise of the worth
+    :return: The number of copied tours
+    """
+    while True:
+        best, best_worth = -1, 0.0
+        i = 0
+        while i < n_candidates:
+            task = plan.lists[CANDIDATES, i]
+            v = plan.nodes[task].tour
+            if v >= 0 and plan.tours[v].length + plan.nodes[task].cost > plan.state[0].limit:
+                look_around(plan, task, n_near)
+                v = plan.nodes[task].tour
+            if v < 0 and n_near > 0:
+                # It comes back when a leg beside it appears.
+                n_candidates -= 1
+                plan.lists[CANDIDATES, i] = plan.lists[CANDIDATES, n_candidates]
+                plan.nodes[task].seen = 0
+                continue
+            if v < 0:
+                i += 1
+                continue
+            worth = plan.nodes[task].noise * plan.nodes[task].value / max(plan.nodes[task].cost, EPSILON)
+            if worth > best_worth:
+                best, best_worth = i, worth
+            i += 1
+        if best < 0:
+            return n_touched
+        task = plan.lists[CANDIDATES, best]
+        n_candidates -= 1
+        plan.lists[CANDIDATES, best] = plan.lists[CANDIDATES, n_candidates]
+        v, a = plan.nodes[task].tour, np.int64(plan.nodes[task].after)
+        n_touched = keep(plan, n_touched, v)
+        place = plan.nodes[a].position + 1 if a > 0 else 1
+        b = plan.routes[v, place]
+        insert(plan, v, place, task, plan.nodes[task].cost)
+        for i in range(n_candidates):
+            other = plan.lists[CANDIDATES, i]
+            if plan.nodes[other].tour == v and plan.nodes[other].after == a:
+                look_around(plan, other, n_near)
+            elif n_near == 0:
+                offer(plan, other, v, a, task)
+                offer(plan, other, v, task, b)
+        for j in range(n_near):
+            other = np.int64(plan.near[task, j])
+            if plan.nodes[other].owner < 0:
+                n_candidates = enter(plan, n_candidates, other, blink, spread)
+                if plan.nodes[other].noise > 0.0:
+                    offer(plan, other, v, a, task)
+                    offer(plan, other, v, task, b)
+
+
+@njit(cache=True, nogil=True)
+def fill_everywhere(plan):
+    """Insert unvisited tasks until none fits anywhere; returns how many."""
+    plan.state[0].clock += 1
+    before = count_visited(plan)
+    n_candidates = 0
+    for task in range(1, len(plan.nodes)):
+        if plan.nodes[task].owner < 0:
+            n_candidates = enter(plan, n_candidates, task, 0.0, 0.0)
+            look_everywhere(plan, task)
+    fill(plan, n_candidates, 0, 0, 0.0, 0.0)
+    for v in range(len(plan.tours)):
+        measure(plan, v)
+    return count_visited(plan) - before
+
+
+@njit(cache=True, nogil=True)
+def replace(plan):  # noqa: C901 (compiled: every call of a helper would pass the whole state)
+    """Swap visited tasks for unvisited ones that are worth more, or as much on a shorter tour; returns how often."""
+    count = 0
+    leg, saved, reach = np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1)
+    for v in range(len(plan.tours)):
+        route = plan.routes[v]
+        stale = True
+        for task in range(1, len(plan.nodes)):
+            if plan.nodes[task].owner >= 0:
+                continue
+            size = plan.tours[v].size
+            if stale:
+                measure(plan, v)
+                for p in range(size + 1):
+                    leg[p] = distance(plan, route[p], route[p + 1])
+                for p in range(1, size + 1):
+                    saved[p] = leg[p - 1] + leg[p] - distance(plan, route[p - 1], route[p + 1])
+                stale = False
+            for p in range(size + 2):
+                reach[p] = distance(plan, route[p], task)
+            # The three cheapest legs; two of them may touch the task that leaves.
+            first, second, third = -1, -1, -1
+            cost1, cost2, cost3 = NOWHERE, NOWHERE, NOWHERE
+            for p in range(size + 1):
+                added = reach[p] + reach[p + 1] - leg[p]
+                if added < cost1:
+                    first, second, third = p, first, second
+                    cost1, cost2, cost3 = added, cost1, cost2
+                elif added < cost2:
+                    second, third = p, second
+                    cost2, cost3 = added, cost2
+                elif added < cost3:
+                    third, cost3 = p, added
+            best, best_leg, best_gain, best_change = -1, -1, 0.0, -EPSILON
+            for p in range(1, size + 1):
+                gain = plan.nodes[task].value - plan.nodes[route[p]].value
+                if gain < best_gain:
+                    continue
+                # Straight into its place, or between two others.
+                at, added = p, reach[p - 1] + reach[p + 1] - (leg[p - 1] + leg[p] - saved[p])
+                for k, cost in ((first, cost1), (second, cost2), (third, cost3)):
+                    if k >= 0 and k != p and k != p - 1:
+                        if cost < added:
+                            at, added = k, cost
+                        break
+                change = added - saved[p]
+                if (gain > best_gain or change < best_change) and plan.tours[v].length + change <= plan.state[0].limit:
+                    best, best_leg, best_gain, best_change = p, at, gain, change
+            if best < 0:
+                continue
+            if best_leg == best:
+                plan.nodes[route[best]].owner = -1
+                route[best] = task
+            else:
+                cut(plan, v, best, 1)
+                insert(plan, v, best_leg + 1 if best_leg < best else best_leg, task, 0.0)
+            stale = True
+            count += 1
+            measure(plan, v)
+    return count
+
+
+# ------------------------------------------------------------------------------------------------------ ruin and recreate
+
+
+@njit(cache=True, nogil=True)
+def ruin(plan, n_removed, v, first, count):
+    """Take a string of tasks out of tour ``v``; returns the number of removed tasks."""
+    route = plan.routes[v]
+    for p in range(first, first + count):
+        plan.lists[REMOVED, n_removed] = route[p]
+        n_removed += 1
+    old = 0.0
+    for p in range(first, first + count + 1):
+        old += distance(plan, route[p - 1], route[p])
+    plan.tours[v].length += distance(plan, route[first - 1], route[first + count]) - old
+    cut(plan, v, first, count)
+    return n_removed
+
+
+@njit(cache=True, nogil=True)
+def recreate(plan, n_removed, n_touched, n_near, blink, spread):
+    """
+    Fill the tours that have been ruined.
+
+    :return: The number of copied tours, and by how much the value and the length of all tours have grown since the ruin began
+    """
+    n_near = min(n_near, plan.near.shape[1])
+    n_candidates = 0
+    for i in range(n_removed):
+        task = plan.lists[REMOVED, i]
+        n_candidates = enter(plan, n_candidates, task, blink, spread)
+        if plan.nodes[task].noise > 0.0:
+            look_around(plan, task, n_near)
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        route = plan.routes[v]
+        leg_before = 0.0
+        for p in range(plan.tours[v].size + 1):
+            node, behind = route[p], route[p + 1]
+            before = route[p - 1] if p > 0 else 0
+            leg_behind = distance(plan, node, behind)
+            for j in range(n_near):
+                task = np.int64(plan.near[node, j])
+                if plan.nodes[task].owner >= 0:
+                    continue
+                n_candidates = enter(plan, n_candidates, task, blink, spread)
+                if plan.nodes[task].noise > 0.0:
+                    reach = distance(plan, node, task)
+                    offer_at(plan, task, v, node, reach + distance(plan, task, behind) - leg_behind)
+                    if p > 0:
+                        offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before)
+            leg_before = leg_behind
+    n_touched = fill(plan, n_candidates, n_touched, n_near, blink, spread)
+    value, length = 0.0, 0.0
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        measure(plan, v)
+        length += plan.tours[v].length - plan.tours[v].old_length
+        for p in range(1, plan.tours[v].size + 1):
+            value += plan.nodes[plan.routes[v, p]].value
+        for p in range(1, plan.tours[v].old_size + 1):
+            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    return n_touched, value, length
+
+
+@njit(cache=True, nogil=True)
+def eject(plan, n_near, max_string):
+    """Take every string of up to ``max_string`` tasks out and fill the gap, wherever that is better; returns how often."""
+    count = 0
+    for task in range(1, len(plan.nodes)):
+        for length in range(1, max_string + 1):
+            v = plan.nodes[task].owner
+            if v < 0:
+                break
+            first = plan.nodes[task].position
+            if first + length - 1 > plan.tours[v].size:
+                break
+            plan.state[0].clock += 1
+            n_touched = keep(plan, 0, v)
+            n_removed = ruin(plan, 0, v, first, length)
+            n_touched, value, change = recreate(plan, n_removed, n_touched, n_near, 0.0, 0.0)
+            if value > EPSILON or (value > -EPSILON and change < -EPSILON):
+                count += 1
+            else:
+                put_back(plan, n_touched)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def descend(plan, n_near_joined, n_near_inserted, max_string):
+    """
+    One round of every neighbourhood.
+
+    :param n_near_joined: To how many neighbours a task may be joined
+    :param n_near_inserted: Beside how many neighbours a task may be inserted where a string has been taken out
+    :param max_string: The longest string of tasks that is taken out; 0 for none
+    :return: Whether anything has changed
+    """
+    n_queued = 0
+    for v in range(len(plan.tours)):
+        for p in range(1, plan.tours[v].size + 1):
+            n_queued = push(plan, n_queued, plan.routes[v, p])
+    changed = shorten(plan, n_queued, n_near_joined)
+    for v in range(len(plan.tours)):
+        measure(plan, v)
+    if fill_everywhere(plan) > 0:
+        changed = True
+    if replace(plan) > 0:
+        return True
+    if changed or max_string == 0:
+        return changed
+    return eject(plan, n_near_inserted, max_string) > 0
+
+
+@njit(cache=True, nogil=True)
+def ruin_around(plan, mean_removed, longest):
+    """
+    Take strings of tasks near a random one out of several tours (SISR, Christiaens and Vanden Berghe, 2020).
+
+    :return: The numbers of removed tasks and of copied tours
+    """
+    n_removed, n_touched = 0, 0
+    n_served, n_flying = 0, 0
+    for v in range(len(plan.tours)):
+        n_served += plan.tours[v].size
+        n_flying += plan.tours[v].size > 0
+    if n_served == 0:
+        return 0, 0
+    longest_here = max(1.0, min(longest, n_served / n_flying))
+    n_strings = int(1.0 + uniform(plan) * max(4.0 * mean_removed / (1.0 + longest_here) - 1.0, 0.0))
+    seed = 1 + int(uniform(plan) * (len(plan.nodes) - 1))
+    for j in range(-1, plan.near.shape[1]):
+        task = seed if j < 0 else np.int64(plan.near[seed, j])
+        v = plan.nodes[task].owner
+        if v < 0 or plan.tours[v].touched == plan.state[0].clock:
+            continue
+        n_touched = keep(plan, n_touched, v)
+        size = plan.tours[v].size
+        count = int(1.0 + uniform(plan) * min(float(size), longest_here))
+        count = min(count, size)
+        # A string around the task, possibly with one task in it that stays.
+        spared = 1 if 1 < count < size and uniform(plan) < 0.5 else 0
+        span = count + spared
+        position = plan.nodes[task].position
+        low, high = max(1, position - span + 1), min(position, size - span + 1)
+        first = low + int(uniform(plan) * (high - low + 1))
+        if spared == 0:
+            n_removed = ruin(plan, n_removed, v, first, count)
+        else:
+            left = 1 + int(uniform(plan) * (count - 1))
+            n_removed = ruin(plan, n_removed, v, first + left + 1, count - left)
+            n_removed = ruin(plan, n_removed, v, first, left)
+        if n_touched >= n_strings:
+            break
+    return n_removed, n_touched
+
+
+@njit(cache=True, nogil=True)
+def anneal(plan, best, n_trials, progress_before, progress_after, settings):
+    """
+    Ruin and recreate, with worse schedules accepted as in simulated annealing.
+
+    :param best: The best schedule so far, updated; owners and positions are not
+    :param n_trials: How many
+    :param progress_before: Which part of all trials lies behind, 0 to 1
+    :param progress_after: Which part will lie behind after these
+    :param settings: :class:`AnnealingSettings`
+    """
+    scale = 0.0
+    for task in range(1, len(plan.nodes)):
+        scale += plan.nodes[task].value
+    scale /= len(plan.nodes) - 1
+    value, length = total_value(plan), total_length(plan)
+    measure_all(best)
+    best_value, best_length = total_value(best), total_length(best)
+    for trial in range(n_trials):
+        plan.state[0].clock += 1
+        n_removed, n_touched = ruin_around(plan, settings.mean_removed, settings.longest_string)
+        if n_removed == 0:
+            if count_visited(plan) == 0:
+                # This is where we begin, or a trial has overlooked all that it had taken out.
+                fill_everywhere(plan)
+                value, length = total_value(plan), total_length(plan)
+            continue
+        n_touched, gain, change = recreate(plan, n_removed, n_touched, settings.n_near, settings.blink, settings.noise)
+        progress = progress_before + (progress_after - progress_before) * (trial / n_trials)
+        temperature = scale * settings.hot * (settings.cold / settings.hot) ** progress
+        score = gain - settings.thrift * value / max(length, EPSILON) * change
+        if score < 0.0 and uniform(plan) >= math.exp(score / temperature):
+            put_back(plan, n_touched)
+            continue
+        value += gain
+        length += change
+        if value > best_value + SAME_VALUE or (value > best_value - SAME_VALUE and length < best_length - EPSILON):
+            best_value, best_length = value, length
+            for v in range(len(plan.tours)):
+                size = plan.tours[v].size
+                best.tours[v].size = size
+                best.routes[v, : size + 2] = plan.routes[v, : size + 2]

@@ -1,0 +1,70 @@
+"""K-means clusters of the tasks, and a trained router for every UAV's tour: the paper's K-means+AM (section V-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_uav.envs.allocation import UNASSIGNED, plan_tours, schedules
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.policies import RouterPolicy
+from sb3_uav.policies.loading import load_policy
+from sb3_uav.solvers.batched import BatchedSolver, parameters_hash
+from sb3_uav.solvers.heuristics import kmeans
+
+
+class KMeansAM(BatchedSolver):
+    """
+    K-means gives every UAV a cluster of tasks, the trained router plans its tour, greedily.
+
+    With the same seed and restarts the clusters are those of ``kmeans-nearest``.
+
+    :param router: The lower level's policy
+    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
+    :raises ValueError: If an argument is not allowed
+    """
+
+    name = "K-means+AM"
+
+    def __init__(self, router: RouterPolicy, restarts: int = 10, batch_size: int | None = None) -> None:
+        super().__init__(batch_size)
+        if restarts < 1:
+            raise ValueError(f"restarts of kmeans-am is {restarts}; K-means needs at least 1 start.")
+        self.router = router
+        self.restarts = restarts
+
+    def settings(self) -> dict[str, Any]:
+        return {"router": parameters_hash(self.router), "restarts": self.restarts}
+
+    def rows_that_fit(self, instances: Instances) -> int:
+        return self.router.rows_that_fit(instances.n_tasks + 1, instances.n_uavs)
+
+    def solve_batch(self, instances: Instances, rows: Sequence[int], seed: int) -> list[Schedule]:
+        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED)
+        for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
+            if n_tasks > 0:
+                points = instances.tasks[i, :n_tasks].numpy()
+                clusters = kmeans(points, instances.n_uavs, np.random.default_rng([seed, row]), self.restarts)
+                assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
+        return schedules(plan_tours(instances, assignment, self.router.plan).tours[:, 0])
+
+
+def load_kmeans_am(router: str, restarts: int = 10, device: str = "auto", batch_size: int | None = None) -> KMeansAM:
+    """
+    :param router: SB3 zip of the router
+    :param restarts: How many times K-means starts anew
+    :param device: Device of the network
+    :param batch_size: How many instances to solve at once; as many as memory allows when None
+    :return: The solver
+    :raises FileNotFoundError: If the zip is missing
+    :raises ValueError: If the zip is damaged or holds another policy, or an argument is not allowed
+    """
+    solver = KMeansAM(load_policy(router, device, RouterPolicy), restarts, batch_size)
+    solver.files = {"router": Path(router)}
+    return solver

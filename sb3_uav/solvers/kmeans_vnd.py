@@ -1,0 +1,62 @@
+"""K-means and variable neighbourhood descent: the paper's conventional baseline in a fast form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.solvers.base import OneByOneSolver, Solution
+from sb3_uav.solvers.heuristics import kmeans, nearest_feasible_schedule
+from sb3_uav.solvers.local_search import LocalSearch
+
+
+class KMeansVND(OneByOneSolver):
+    """
+    K-means clusters of the tasks, one for every UAV, and variable neighbourhood descent on each (the paper's K-means+VND).
+
+    Every tour starts with the nearest feasible tasks of its cluster. Three neighbourhoods follow one another until none has
+    anything better: shorter tours (2-opt, or-opt), insertion of a task that is left over, and replacement of a visited task by
+    one that is worth more or as much on a shorter tour. Tours exchange no tasks.
+
+    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :raises ValueError: If there is not at least one start
+    :raises ImportError: If numba is not installed
+    """
+
+    name = "kmeans-vnd"
+    uses_time_limit = False
+
+    def __init__(self, restarts: int = 10) -> None:
+        if restarts < 1:
+            raise ValueError(f"restarts of kmeans-vnd is {restarts}; K-means needs at least 1 start.")
+        self.restarts = restarts
+
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
+        start = nearest_feasible_schedule(instance, clusters)
+        return Solution(Schedule(descend(instance, clusters == uav, route) for uav, route in enumerate(start.routes)))
+
+
+def descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tuple[int, ...]:
+    """
+    :param instance: A batch of one
+    :param mine: ``(n_tasks,)`` bool, the tasks that the UAV may visit
+    :param route: Some of them, in flying order
+    :return: A better route over them
+    """
+    tasks = np.flatnonzero(mine)
+    if len(tasks) == 0:
+        return ()
+    alone = replace(
+        instance,
+        tasks=instance.tasks[:, tasks],
+        values=instance.values[:, tasks],
+        task_mask=instance.task_mask[:, tasks],
+        n_uavs=1,
+    )
+    start = Schedule([np.searchsorted(tasks, route)])
+    found = LocalSearch(alone).repair(start, max_string=0)
+    return tuple(tasks[list(found.routes[0])].tolist())

@@ -1,0 +1,57 @@
+"""What the solvers share that search until a time limit, or that need a package of their own."""
+
+from __future__ import annotations
+
+import math
+import time
+from importlib import import_module
+from types import ModuleType
+
+from sb3_uav.solvers.base import OneByOneSolver
+
+
+def deadline_after(time_limit: float, whose: str) -> float:
+    """
+    :param time_limit: Seconds from now
+    :param whose: What has this limit, named in errors
+    :return: When it ends, in seconds of ``time.perf_counter``
+    :raises ValueError: If the limit is not a finite number above 0
+    """
+    if not 0 < time_limit < math.inf:
+        raise ValueError(f"time_limit of {whose} is {time_limit:g} seconds; it must be more than 0, and finite.")
+    return time.perf_counter() + time_limit
+
+
+class TimeLimitedSolver(OneByOneSolver):
+    """
+    A solver that searches until a time limit.
+
+    :param time_limit: Seconds per instance when :meth:`solve` is given none
+    :raises ValueError: If it is not a finite number above 0
+    """
+
+    def __init__(self, time_limit: float) -> None:
+        deadline_after(time_limit, self.name)
+        self.time_limit = time_limit
+
+    def deadline(self, time_limit: float | None) -> float:
+        """
+        :param time_limit: Seconds from now, or None for the solver's own limit
+        :return: When it ends, in seconds of ``time.perf_counter``
+        :raises ValueError: If the limit is not a finite number above 0
+        """
+        return deadline_after(self.time_limit if time_limit is None else time_limit, self.name)
+
+
+def require(module: str, solver: str, extra: str = "solvers") -> ModuleType:
+    """
+    :param module: An optional module
+    :param solver: Name of the solver that needs it
+    :param extra: The extra of sb3-uav that brings it
+    :return: The imported module
+    :raises ImportError: With the command that installs it
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ImportError(f"Solver {solver} needs {module} ({error}); run: pip install 'sb3-uav[{extra}]'") from error

@@ -1,0 +1,125 @@
+"""OR-Tools' routing library: the paper's baseline, and the same with guided local search."""
+
+from __future__ import annotations
+
+import time
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.solvers.base import OneByOneSolver, Solution
+from sb3_uav.solvers.limits import TimeLimitedSolver, require
+from sb3_uav.solvers.reduction import RESOLUTION, ReducedInstance
+
+# Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
+LARGEST_PRIZE = 1_000_000
+# More than any move of the local search takes.
+SECONDS_PER_MOVE = 86_400
+# OR-Tools adds in int64; this leaves room for the distances.
+LARGEST_COST = 2**60
+
+
+class ORTools(OneByOneSolver):
+    """
+    A first solution by PATH_CHEAPEST_ARC and local search to its local optimum, without a metaheuristic: the OR-Tools row of
+    the paper's tables.
+
+    Arcs cost their length, and every unvisited task a penalty in proportion to its value that outweighs all the length that
+    the fleet can save. There is no time limit, and nothing is random.
+
+    :raises ImportError: If OR-Tools is not installed
+    """
+
+    name = "ortools"
+    uses_time_limit = False
+
+    def __init__(self) -> None:
+        _require_routing(self.name)
+
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        return Solution(_solve(self.name, instance))
+
+
+class ORToolsGLS(TimeLimitedSolver):
+    """
+    The same with OR-Tools' guided local search until the time limit.
+
+    It goes on to the limit even when all tasks are visited, because OR-Tools then still shortens the tours.
+
+    :param time_limit: Seconds per instance
+    :raises ImportError: If OR-Tools is not installed
+    :raises ValueError: If the time limit is not a finite number above 0
+    """
+
+    name = "ortools-gls"
+
+    def __init__(self, time_limit: float = 10.0) -> None:
+        super().__init__(time_limit)
+        _require_routing(self.name)
+
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        return Solution(_solve(self.name, instance, self.deadline(time_limit)))
+
+
+def _require_routing(solver: str) -> Any:
+    """
+    :param solver: Name of the solver that needs it
+    :return: The module ``ortools.constraint_solver.pywrapcp``
+    :raises ImportError: If OR-Tools is not installed
+    """
+    return require("ortools.constraint_solver.pywrapcp", solver)
+
+
+def _solve(solver: str, instance: Instances, deadline: float | None = None) -> Schedule:
+    """
+    :param solver: Name of the solver, for errors
+    :param instance: A batch of one
+    :param deadline: When guided local search ends, in seconds of ``time.perf_counter``; plain local search when None
+    :return: The schedule; an empty one if the deadline came before the first solution
+    """
+    pywrapcp = _require_routing(solver)
+    reduced = ReducedInstance.of(instance)
+    if reduced.n_tasks == 0:
+        return reduced.schedule([])
+    manager = pywrapcp.RoutingIndexManager(reduced.n_tasks + 1, reduced.n_uavs, 0)
+    routing = pywrapcp.RoutingModel(manager)
+    transit = routing.RegisterTransitMatrix(reduced.integer_distances().tolist())
+    routing.SetArcCostEvaluatorOfAllVehicles(transit)
+    routing.AddDimension(transit, 0, RESOLUTION, True, "distance")
+    for node, penalty in enumerate(reduced.integer_prizes(LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
+        routing.AddDisjunction([manager.NodeToIndex(node)], penalty)
+    solution = routing.SolveWithParameters(_search_parameters(pywrapcp, deadline))
+    if solution is None:
+        return reduced.schedule([])
+    routes = []
+    for uav in range(reduced.n_uavs):
+        route = []
+        index = solution.Value(routing.NextVar(routing.Start(uav)))
+        while not routing.IsEnd(index):
+            route.append(manager.IndexToNode(index))
+            index = solution.Value(routing.NextVar(index))
+        routes.append(route)
+    return reduced.schedule(routes)
+
+
+def _search_parameters(pywrapcp: Any, deadline: float | None) -> Any:
+    """
+    :param pywrapcp: The module
+    :param deadline: As in :func:`_solve`
+    :return: OR-Tools' search parameters
+    """
+    parameters = pywrapcp.DefaultRoutingSearchParameters()
+    enums = import_module("ortools.constraint_solver.routing_enums_pb2")
+    parameters.first_solution_strategy = enums.FirstSolutionStrategy.PATH_CHEAPEST_ARC
+    if deadline is None:
+        parameters.local_search_metaheuristic = enums.LocalSearchMetaheuristic.GREEDY_DESCENT
+        # By default some of its moves give up after 0.1 s, and a busy machine finds another local optimum.
+        parameters.lns_time_limit.FromSeconds(SECONDS_PER_MOVE)
+    else:
+        parameters.local_search_metaheuristic = enums.LocalSearchMetaheuristic.GUIDED_LOCAL_SEARCH
+        # Building the model counts too.
+        parameters.time_limit.FromMilliseconds(max(1, round(1000 * (deadline - time.perf_counter()))))
+    return parameters

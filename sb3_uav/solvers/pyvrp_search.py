@@ -1,0 +1,159 @@
+"""PyVRP: iterated local search for vehicle routing with optional clients, from nothing or from a given schedule."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.solvers.base import Solution
+from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after, require
+from sb3_uav.solvers.reduction import RESOLUTION, ReducedInstance
+
+# Its interface changes with every minor version.
+SUPPORTED_VERSION = "0.14."
+NUM_NEIGHBOURS = 20
+# Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
+LARGEST_PRIZE = 100_000
+# How far PyVRP may raise the cost of tours that are too long: for an excess of the maximum flight distance, to so many times
+# the largest prize. Its own bound, per unit of distance, suffices for equal values; it is far too low for prizes that differ
+# much, because infeasible tours would pay and no feasible schedule be found.
+PENALTY_PER_PRIZE = 1000
+DEFAULT_MAX_PENALTY = 100_000.0
+# PyVRP adds in int64; this leaves room for the sum of two costs.
+LARGEST_COST = 2**61
+
+
+class PyVRP(TimeLimitedSolver):
+    """
+    PyVRP's iterated local search: tasks are optional clients whose prizes outweigh all the length that the fleet can save, so
+    that value is maximised first and length minimised second. It ends before the time limit when all tasks are visited.
+
+    :param time_limit: Seconds per instance
+    :param num_neighbours: Size of the granular neighbourhoods
+    :raises ImportError: If PyVRP 0.14 is not installed
+    :raises ValueError: If the time limit is not a finite number above 0, or the number of neighbours is below 1
+    """
+
+    name = "pyvrp"
+
+    def __init__(self, time_limit: float = 10.0, num_neighbours: int = NUM_NEIGHBOURS) -> None:
+        super().__init__(time_limit)
+        if num_neighbours < 1:
+            raise ValueError(f"num_neighbours of pyvrp is {num_neighbours}; give at least 1.")
+        _require_pyvrp(self.name)
+        self.num_neighbours = num_neighbours
+
+    def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        deadline = self.deadline(time_limit)
+        return Solution(_search(instance, None, deadline, int(rng.integers(2**31)), self.num_neighbours))
+
+
+def polish_schedule(
+    instance: Instances, schedule: Schedule, time_limit: float, seed: int = 0, num_neighbours: int = NUM_NEIGHBOURS
+) -> Schedule:
+    """
+    Improve a schedule with PyVRP, which starts from it.
+
+    :param instance: A batch of one
+    :param schedule: A feasible schedule of it
+    :param time_limit: Seconds
+    :param seed: Of PyVRP
+    :param num_neighbours: Size of the granular neighbourhoods
+    :return: A feasible schedule of at least the same value
+    :raises ImportError: If PyVRP 0.14 is not installed
+    :raises ValueError: If the time limit is not a finite number above 0
+    """
+    found = _search(instance, schedule, deadline_after(time_limit, "polish_schedule"), seed, num_neighbours)
+    return max(found, schedule, key=lambda candidate: _total_value(instance, candidate))
+
+
+def _require_pyvrp(solver: str) -> Any:
+    """
+    :param solver: Name of the solver that needs it
+    :return: The module ``pyvrp``
+    :raises ImportError: If it is not installed, or not in a supported version
+    """
+    pyvrp = require("pyvrp", solver)
+    found = version("pyvrp")
+    if not found.startswith(SUPPORTED_VERSION):
+        raise ImportError(
+            f"Solver {solver} needs PyVRP 0.14, which needs Python 3.11 or newer; found PyVRP {found}. "
+            "Run: pip install 'sb3-uav[solvers]'"
+        )
+    return pyvrp
+
+
+def _total_value(instance: Instances, schedule: Schedule) -> float:
+    values = instance.values[0].tolist()
+    return sum(values[task] for route in schedule.routes for task in route)
+
+
+def _search(instance: Instances, initial: Schedule | None, deadline: float, seed: int, num_neighbours: int) -> Schedule:
+    """
+    :param instance: A batch of one
+    :param initial: Where to start; a random solution when None
+    :param deadline: When to stop, in seconds of ``time.perf_counter``
+    :param seed: Of PyVRP
+    :param num_neighbours: Size of the granular neighbourhoods
+    :return: The best schedule found
+    """
+    pyvrp = _require_pyvrp("pyvrp")
+    reduced = ReducedInstance.of(instance)
+    if reduced.n_tasks == 0:
+        return reduced.schedule([])
+    prizes = reduced.integer_prizes(LARGEST_PRIZE, LARGEST_COST // PENALTY_PER_PRIZE)
+    data = _problem_data(pyvrp, reduced, prizes)
+    params = pyvrp.SolveParams(
+        neighbourhood=pyvrp.search.NeighbourhoodParams(num_neighbours=num_neighbours),
+        penalty=pyvrp.PenaltyParams(max_penalty=max(DEFAULT_MAX_PENALTY, PENALTY_PER_PRIZE * prizes.max() / RESOLUTION)),
+    )
+
+    least_prize = int(prizes.min())
+
+    def stop(best_cost: int) -> bool:
+        # A feasible solution that costs less than any prize has collected them all.
+        return best_cost < least_prize or time.perf_counter() >= deadline
+
+    with warnings.catch_warnings():
+        # That penalties reached their bound is no news to the caller, whose instance always has a feasible solution.
+        warnings.simplefilter("ignore", pyvrp.exceptions.PenaltyBoundWarning)
+        best = pyvrp.solve(
+            data,
+            stop,
+            seed,
+            collect_stats=False,
+            params=params,
+            initial_solution=None
+            if initial is None
+            else pyvrp.Solution(data, [[node - 1 for node in route] for route in reduced.routes(initial)]),
+        ).best
+    return reduced.schedule(
+        [activity.idx + 1 for activity in route if activity.is_client()]
+        for route in best.routes()
+        if not route.has_excess_distance()
+    )
+
+
+def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> Any:
+    """
+    :param pyvrp: The module
+    :param reduced: What to plan
+    :param prizes: ``(n,)`` int64
+    :return: PyVRP's description of it; client ``i`` is node ``i + 1``
+    """
+    distances = reduced.integer_distances()
+    return pyvrp.ProblemData(
+        # All distances are in the matrix.
+        locations=[pyvrp.Location(0, 0)] * len(distances),
+        clients=[pyvrp.Client(node, prize=prize, required=False) for node, prize in enumerate(prizes.tolist(), start=1)],
+        depots=[pyvrp.Depot(0)],
+        vehicle_types=[pyvrp.VehicleType(num_available=reduced.n_uavs, max_distance=RESOLUTION)],
+        distance_matrices=[distances],
+        duration_matrices=[np.zeros_like(distances)],
+    )

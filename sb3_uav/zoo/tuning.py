@@ -1,0 +1,198 @@
+"""
+Search spaces of ``-optimize`` for our environments, in rl_zoo3's form: a sampler, and a converter of what it drew.
+
+rl_zoo3's own spaces for on-policy algorithms replace the network's arguments, discount rewards, and cut episodes anywhere.
+Ours leave to the YAML entry
+
+- the network (``policy`` and ``policy_kwargs``), because no trial sees what a larger one costs in time;
+- the discount ``gamma``, which is 1 in ours: a task visited late counts as much as one visited early;
+- the rollout (``n_envs`` and ``n_steps``), which holds whole episodes in ours;
+- the router under ``ITSCallback``; tune it on a ``RoutePlanning`` environment.
+
+=================== ============================= ========== ===== ===========
+hyperparameter      values                        reinforce  ppo   a2c
+=================== ============================= ========== ===== ===========
+learning_rate       1e-4 to 5e-3, logarithmic     yes        yes   yes
+max_grad_norm       0.3 to 5, logarithmic         yes        yes   yes
+ent_coef            1e-5 to 3e-2, logarithmic     yes        yes   yes
+gae_lambda          0.9, 0.95, 0.98, 0.99, 1                 yes   yes
+vf_coef             1e-3 to 1, logarithmic                   yes   yes
+batch_size          256, 512, ..., 8192                      yes
+n_epochs            1 to 8                                   yes
+clip_range          0.1, 0.2, 0.3                            yes
+normalize_advantage true, false                   yes              yes
+use_rms_prop        true, false                                    yes
+baseline            shared, rollout, critic       yes
+n_samples           2, 4, 8, 16                   yes
+=================== ============================= ========== ===== ===========
+
+``ppo_mask`` has the space of ``ppo``. On other environments ``ppo``, ``ppo_mask`` and ``a2c`` have rl_zoo3's own spaces, and
+``reinforce`` one with ``gamma`` and ``n_steps`` and without samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
+from rl_zoo3.hyperparams_opt import (
+    HYPERPARAMS_CONVERTER,
+    HYPERPARAMS_SAMPLER,
+    convert_onpolicy_params,
+    sample_a2c_params,
+    sample_ppo_params,
+)
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_uav.envs.gym_env import ProblemEnv
+
+Params = dict[str, Any]
+Converter = Callable[[Params], Params]
+# Of the trial (optuna.Trial), the number of actions (for noise), n_envs and what off-policy algorithms need.
+Sampler = Callable[[Any, int, int, Params], Params]
+
+
+def suggest_common(trial: Any) -> Params:
+    """:param trial: Draws what every algorithm has"""
+    return {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True),
+        "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 5.0, log=True),
+        "ent_coef": trial.suggest_float("ent_coef", 1e-5, 0.03, log=True),
+    }
+
+
+def suggest_critic(trial: Any) -> Params:
+    """:param trial: Draws what algorithms with a critic have"""
+    return {
+        "gae_lambda": trial.suggest_categorical("gae_lambda", [0.9, 0.95, 0.98, 0.99, 1.0]),
+        "vf_coef": trial.suggest_float("vf_coef", 1e-3, 1.0, log=True),
+    }
+
+
+def sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """PPO and MaskablePPO on our environments; parameters and result as in rl_zoo3."""
+    hyperparams = convert_powers(
+        {
+            **suggest_common(trial),
+            **suggest_critic(trial),
+            "batch_size_pow": trial.suggest_int("batch_size_pow", 8, 13),
+            "n_epochs": trial.suggest_int("n_epochs", 1, 8),
+            "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
+        }
+    )
+    # As rl_zoo3 does, so that reports show the number itself too.
+    trial.set_user_attr("batch_size", hyperparams["batch_size"])
+    return hyperparams
+
+
+def sample_a2c(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """A2C on our environments; parameters and result as in rl_zoo3."""
+    return {
+        **suggest_common(trial),
+        **suggest_critic(trial),
+        "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
+        "use_rms_prop": trial.suggest_categorical("use_rms_prop", [False, True]),
+    }
+
+
+def sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """REINFORCE on our environments, playing whole episodes; parameters and result as in rl_zoo3."""
+    return convert_reinforce(
+        {
+            **suggest_common(trial),
+            "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
+            "baseline": trial.suggest_categorical("baseline", ["shared", "rollout", "critic"]),
+            "n_samples_pow": trial.suggest_int("n_samples_pow", 1, 4),
+        }
+    )
+
+
+def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+    """REINFORCE on any other environment, in SB3's loop; parameters and result as in rl_zoo3."""
+    return convert_reinforce(
+        {
+            **suggest_common(trial),
+            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.03, log=True),
+            "n_steps_pow": trial.suggest_int("n_steps_pow", 6, 11),
+            "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
+            "baseline": trial.suggest_categorical("baseline", ["exponential", "critic"]),
+        }
+    )
+
+
+def convert_powers(params: Params) -> Params:
+    """
+    :param params: What a trial drew
+    :return: Hyperparameters: ``x_pow`` is the binary logarithm of ``x``, ``one_minus_x`` is 1 - ``x``
+    """
+    converted: Params = {}
+    for name, value in params.items():
+        if name.endswith("_pow"):
+            converted[name.removesuffix("_pow")] = 2**value
+        elif name.startswith("one_minus_"):
+            converted[name.removeprefix("one_minus_")] = 1 - value
+        else:
+            converted[name] = value
+    return converted
+
+
+def convert_reinforce(params: Params) -> Params:
+    """
+    :param params: What a trial of REINFORCE drew
+    :return: Hyperparameters; arguments of the YAML's baseline do not go with another one
+    """
+    return {**convert_powers(params), "baseline_kwargs": None}
+
+
+OUR_SPACES: dict[str, tuple[Sampler, Converter]] = {
+    "reinforce": (sample_reinforce, convert_reinforce),
+    "ppo": (sample_ppo, convert_powers),
+    "ppo_mask": (sample_ppo, convert_powers),
+    "a2c": (sample_a2c, convert_powers),
+}
+OTHER_SPACES: dict[str, tuple[Sampler, Converter]] = {
+    "reinforce": (sample_reinforce_steps, convert_reinforce),
+    "ppo": (sample_ppo_params, convert_onpolicy_params),
+    "ppo_mask": (sample_ppo_params, convert_onpolicy_params),
+    "a2c": (sample_a2c_params, convert_onpolicy_params),
+}
+
+
+def register_search_spaces(env_id: str) -> None:
+    """
+    Let rl_zoo3 use the search spaces for this environment, from now on.
+
+    :param env_id: Id of a registered environment
+    """
+    samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
+    converters: dict[str, Any] = HYPERPARAMS_CONVERTER
+    for algo, (sampler, converter) in (OUR_SPACES if is_ours(env_id) else OTHER_SPACES).items():
+        samplers[algo], converters[algo] = sampler, converter
+
+
+def is_ours(env_id: str) -> bool:
+    """
+    :param env_id: Id of a registered environment
+    :return: Whether it is one of this package, or a user's subclass of one
+    """
+    entry_point = gym.spec(env_id).entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return isinstance(creator, type) and issubclass(creator, ProblemEnv)
+
+
+class StopWhenDiverged(BaseCallback):
+    """
+    Stops a training whose parameters are no longer finite, which the fused driver would not notice by itself.
+
+    :raises ValueError: At the start of a rollout; ``-optimize`` prunes a trial on it
+    """
+
+    def _on_rollout_start(self) -> None:
+        for name, parameter in self.model.policy.named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(f"Training diverged: {name} is not finite after {self.num_timesteps} steps.")
+
+    def _on_step(self) -> bool:
+        return True

@@ -1,0 +1,126 @@
+"""Every file in `examples/` runs as a user would run it, but for the size of the run, and prints what it says."""
+
+import ast
+import multiprocessing
+import os
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch as th
+
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.policies.loading import load_policy
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NUMBER = r"(\d+\.\d+)"
+
+
+# Processes of their own, forked from one that has imported what takes seconds to import.
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["sb3_contrib", "sb3_uav.training", "sb3_uav.solvers", "matplotlib.figure"])
+
+
+def play(path: Path, folder: Path, arguments: tuple[str, ...]) -> None:
+    os.chdir(folder)
+    sys.argv = [str(path), *arguments]
+    th.set_num_threads(1)
+    # Closed at the end of the process, after it has written what went wrong.
+    sys.stdout, sys.stderr = (folder / "printed.txt").open("w"), (folder / "errors.txt").open("w")
+    runpy.run_path(str(path), run_name="__main__")
+
+
+def run(name: str, folder: Path, *arguments: str) -> str:
+    """What the example printed, started in this folder."""
+    process = FORKS.Process(target=play, args=(EXAMPLES / f"{name}.py", folder, arguments))
+    process.start()
+    process.join()
+    assert process.exitcode == 0, (folder / "errors.txt").read_text()
+    return (folder / "printed.txt").read_text()
+
+
+def numbers(pattern: str, text: str) -> list[float]:
+    """The groups of the one match of a pattern."""
+    (found,) = re.finditer(pattern, text)
+    return [float(group) for group in found.groups()]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_each_is_short_and_says_what_it_shows(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 60 and len(ast.get_docstring(ast.parse(text)) or "") > 80
+    tested = re.findall(r'run\("(\w+)"', Path(__file__).read_text())
+    assert path.stem in tested and "argparse" in text
+
+
+@pytest.mark.slow
+def test_ppo(tmp_path):
+    untrained, trained, n_steps = numbers(
+        rf"Tasks on a tour: {NUMBER} untrained, {NUMBER} after (\d+) steps", run("ppo", tmp_path, "--timesteps", "3000")
+    )
+    assert 2.5 < untrained < 20 and 2.5 < trained < 20 and n_steps >= 3000
+
+
+@pytest.mark.slow
+def test_maskable_ppo(tmp_path):
+    n_tasks, illegal = numbers(
+        rf"Tasks on a tour: {NUMBER}; illegal actions: (\d+)", run("maskable_ppo", tmp_path, "--timesteps", "1000")
+    )
+    assert 2.5 < n_tasks < 20 and illegal == 0
+
+
+@pytest.mark.slow
+def test_multi_input_policy(tmp_path):
+    printed = run("multi_input_policy", tmp_path, "--timesteps", "1000")
+    assert 2 < numbers(rf"Allocator: {NUMBER} tasks visited by the fleet", printed)[0] < 20
+    assert 2 < numbers(rf"Router: {NUMBER} tasks on a tour", printed)[0] < 20
+
+
+@pytest.mark.slow
+def test_reinforce(tmp_path):
+    printed = run("reinforce", tmp_path, "--timesteps", "10000")
+    for n_tasks in (20, 50):
+        greedy, sampled = numbers(rf"{n_tasks} tasks: {NUMBER} visited greedily, {NUMBER} by the best of 16 samples", printed)
+        assert 2.5 < greedy < sampled < n_tasks
+
+
+@pytest.mark.slow
+def test_both_levels_evaluated_and_drawn(tmp_path):
+    """The zips that one example writes are what the other one reads."""
+    printed = run("its_ppo", tmp_path, "--timesteps", "2560")
+    assert "router epoch 1 (pre-training)" in printed and "allocator epoch 2 (intensive)" in printed
+    assert isinstance(load_policy(tmp_path / "pair" / "allocator.zip"), AllocatorPolicy)
+    assert isinstance(load_policy(tmp_path / "pair" / "router.zip"), RouterPolicy)
+    printed = run("evaluate_and_draw", tmp_path, "--n-instances", "4")
+    objectives = {}
+    for solver in ("DL-DRL (greedy)", "DL-DRL (sampling 64)", "kmeans-nearest"):
+        (line,) = re.findall(rf"{re.escape(solver)}: (.*)", printed)
+        objectives[solver], length = numbers(rf"{NUMBER} tasks, tours of {NUMBER} on average", line)
+        assert 0 < length <= 1.5
+    assert objectives["DL-DRL (greedy)"] <= objectives["DL-DRL (sampling 64)"] <= 20
+    assert (tmp_path / "schedule.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_freeze_extractor(tmp_path):
+    printed = run("freeze_extractor", tmp_path, "--timesteps", "2560")
+    in_encoder, n_encoder, elsewhere, n_elsewhere = numbers(
+        r"Parameters that changed: (\d+) of (\d+) in the encoder,\n(\d+) of (\d+) elsewhere", printed
+    )
+    assert in_encoder == 0 < n_encoder and elsewhere == n_elsewhere > 0
+
+
+@pytest.mark.slow
+def test_own_coordinates(tmp_path):
+    printed = run("own_coordinates", tmp_path, "--timesteps", "3000")
+    n_stops = 0
+    for uav in range(2):
+        (length, stops), *others = re.findall(rf"UAV {uav}, (\d+) m of 5000 m: (.*)", printed)
+        assert not others and 0 < float(length) <= 5000
+        points = [tuple(map(int, point)) for point in re.findall(r"\((\d+), (\d+)\)", stops)]
+        # One UAV flies west of the depot, the other one east of it.
+        assert points and all((x < 1200) == (uav == 1) for x, _ in points)
+        n_stops += len(points)
+    assert f"{n_stops} of 15 tasks visited" in printed
