@@ -10,7 +10,7 @@ GENERALISATION_SIZES = (600, 700, 800, 900, 1000, 1500)
 # With the paper's D = 2.0, nearly all of so few tasks could be visited, and there would be little to learn.
 DEMO_FLEET, DEMO_SIZE, DEMO_MAX_DISTANCE = 3, 20, 1.5
 # Training batches of mixed sizes, for one pair of networks that serves them all.
-UNIVERSAL_ID, UNIVERSAL_FLEET, UNIVERSAL_SIZE = "TaskAllocation-Universal-v0", 8, 400
+UNIVERSAL_ID, UNIVERSAL_FLEET, UNIVERSAL_SIZE = "TaskAllocation-Universal-v0", 8, 500
 
 
 def allocation_id(n_uavs: int, n_tasks: int) -> str:
