@@ -100,6 +100,11 @@ class Interrupted(Stub):
         raise KeyboardInterrupt
 
 
+class Refusing(Stub):
+    def __init__(self, time_limit: float) -> None:
+        raise ValueError(f"time_limit of refusing is {time_limit:g} seconds.")
+
+
 class Timed(Stub):
     """Visits a task only if it has more than a second, and refuses to work without any time."""
 
@@ -265,19 +270,21 @@ def test_zips_of_other_parameters_are_not_mixed_up(inputs: Inputs, tmp_path: Pat
 def test_solvers_that_fail_leave_the_others(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Not installed, not made for this fleet, no time: each is named, the others' results are printed, the exit code is 3."""
+    """Not installed, refused options, another fleet, no time: each is named, the others are evaluated, the exit code is 3."""
     monkeypatch.setitem(SOLVERS, "absent", "a_module_that_is_not_installed:Solver")
     monkeypatch.setitem(SOLVERS, "timed", f"{__name__}:Timed")
+    monkeypatch.setitem(SOLVERS, "refusing", f"{__name__}:Refusing")
     UniformGenerator(5, n_uavs=5)(1, np.random.default_rng(0)).save(tmp_path / "U5.npz")
     code = run(
         *inputs.pair, "--instances", inputs.small, tmp_path / "U5.npz", "--out", tmp_path / "out",
-        "--time-limit", 0, "--solvers", "absent", "timed", "random-nearest",
+        "--time-limit", 0, "--solvers", "absent", "refusing:time_limit=0", "timed", "random-nearest",
     )  # fmt: skip
     assert code == 3
     captured = capsys.readouterr()
     for message in (
         "DL-DRL (greedy) failed on 1 of 1 instances of U5: The allocator was trained for 3 UAVs",
         "absent failed on 4 of 4 instances of U3-N20: No module named 'a_module_that_is_not_installed'",
+        "refusing:time_limit=0 failed on 4 of 4 instances of U3-N20: time_limit of refusing is 0 seconds.",
         "timed failed on 4 of 4 instances of U3-N20: Give timed a time limit above 0.",
     ):
         assert f"sb3-uav: {message}" in captured.err
