@@ -160,10 +160,6 @@ SOLVERS: dict[str, str] = {
 }
 
 
-class RefusedOptionsError(ValueError):
-    """A solver exists and has these options, but not with these values, say a time limit of 0."""
-
-
 def make_solver(spec: str, **defaults: Any) -> Solver:
     """
     Make a solver from text.
@@ -172,10 +168,8 @@ def make_solver(spec: str, **defaults: Any) -> Solver:
         ``name``, which tables and files shall call it by
     :param defaults: Arguments for solvers that have them, where ``spec`` does not give them
     :return: The solver; unless told otherwise its ``name`` is the whole ``spec``, so that variants can be told apart
-    :raises ValueError: If the name or a key is unknown, or a value is of the wrong type; the message lists the choices
-    :raises RefusedOptionsError: If the solver itself refuses a value; another ``ValueError``
+    :raises ValueError: If the name, a key or a value is not allowed; the message lists the choices
     :raises ImportError: If the solver needs a package that is not installed
-    :raises OSError: If a file that an option names cannot be read
     """
     name, _, text = spec.partition(":")
     if name not in SOLVERS:
@@ -183,10 +177,7 @@ def make_solver(spec: str, **defaults: Any) -> Solver:
     module, _, attribute = SOLVERS[name].partition(":")
     factory: Callable[..., Solver] = getattr(import_module(module), attribute)
     options, label = _parse_options(name, text, factory, defaults)
-    try:
-        solver = factory(**options)
-    except ValueError as error:
-        raise RefusedOptionsError(str(error)) from error
+    solver = factory(**options)
     solver.name, solver.spec = label or spec, spec
     return solver
 
