@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 # Before anything imports matplotlib: tests never open a window.
 os.environ["MPLBACKEND"] = "Agg"
@@ -25,6 +26,14 @@ settings.load_profile("repeatable")
 th.set_num_threads(1)
 
 seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """SB3's loggers leave a folder for every model in the system's temporary folder otherwise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("sb3_logs")))
+        yield
 
 
 @pytest.fixture

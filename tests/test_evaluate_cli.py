@@ -22,6 +22,7 @@ from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import SOLVERS, Solver, SolverResult
+from sb3_uav.solvers.limits import deadline_after
 from sb3_uav.solvers.results import RESULT_COLUMNS, file_hash
 from sb3_uav.zoo import cli
 
@@ -98,6 +99,11 @@ class Stub(Solver):
 class Interrupted(Stub):
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         raise KeyboardInterrupt
+
+
+class Refusing(Stub):
+    def __init__(self, time_limit: float) -> None:
+        deadline_after(time_limit, "refusing")
 
 
 class Timed(Stub):
@@ -265,19 +271,21 @@ def test_zips_of_other_parameters_are_not_mixed_up(inputs: Inputs, tmp_path: Pat
 def test_solvers_that_fail_leave_the_others(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Not installed, not made for this fleet, no time: each is named, the others' results are printed, the exit code is 3."""
+    """Not installed, not for this fleet, no time: each is named, the others are evaluated, the exit code is 3."""
     monkeypatch.setitem(SOLVERS, "absent", "a_module_that_is_not_installed:Solver")
     monkeypatch.setitem(SOLVERS, "timed", f"{__name__}:Timed")
+    monkeypatch.setitem(SOLVERS, "refusing", f"{__name__}:Refusing")
     UniformGenerator(5, n_uavs=5)(1, np.random.default_rng(0)).save(tmp_path / "U5.npz")
     code = run(
         *inputs.pair, "--instances", inputs.small, tmp_path / "U5.npz", "--out", tmp_path / "out",
-        "--time-limit", 0, "--solvers", "absent", "timed", "random-nearest",
+        "--time-limit", 0, "--solvers", "absent", "refusing:time_limit=0", "timed", "random-nearest",
     )  # fmt: skip
     assert code == 3
     captured = capsys.readouterr()
     for message in (
         "DL-DRL (greedy) failed on 1 of 1 instances of U5: The allocator was trained for 3 UAVs",
         "absent failed on 4 of 4 instances of U3-N20: No module named 'a_module_that_is_not_installed'",
+        "refusing:time_limit=0 failed on 4 of 4 instances of U3-N20: time_limit of refusing is 0 seconds; it must be more than 0",
         "timed failed on 4 of 4 instances of U3-N20: Give timed a time limit above 0.",
     ):
         assert f"sb3-uav: {message}" in captured.err

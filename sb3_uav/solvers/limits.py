@@ -10,15 +10,19 @@ from types import ModuleType
 from sb3_uav.solvers.base import OneByOneSolver
 
 
+class TimeLimitError(ValueError):
+    """A time limit that leaves no time, or never ends."""
+
+
 def deadline_after(time_limit: float, whose: str) -> float:
     """
     :param time_limit: Seconds from now
     :param whose: What has this limit, named in errors
     :return: When it ends, in seconds of ``time.perf_counter``
-    :raises ValueError: If the limit is not a finite number above 0
+    :raises TimeLimitError: If the limit is not a finite number above 0
     """
     if not 0 < time_limit < math.inf:
-        raise ValueError(f"time_limit of {whose} is {time_limit:g} seconds; it must be more than 0, and finite.")
+        raise TimeLimitError(f"time_limit of {whose} is {time_limit:g} seconds; it must be more than 0, and finite.")
     return time.perf_counter() + time_limit
 
 
@@ -27,7 +31,7 @@ class TimeLimitedSolver(OneByOneSolver):
     A solver that searches until a time limit.
 
     :param time_limit: Seconds per instance when :meth:`solve` is given none
-    :raises ValueError: If it is not a finite number above 0
+    :raises TimeLimitError: If it is not a finite number above 0
     """
 
     def __init__(self, time_limit: float) -> None:
@@ -38,7 +42,7 @@ class TimeLimitedSolver(OneByOneSolver):
         """
         :param time_limit: Seconds from now, or None for the solver's own limit
         :return: When it ends, in seconds of ``time.perf_counter``
-        :raises ValueError: If the limit is not a finite number above 0
+        :raises TimeLimitError: If the limit is not a finite number above 0
         """
         return deadline_after(self.time_limit if time_limit is None else time_limit, self.name)
 
