@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, ClassVar, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -39,14 +39,14 @@ class Solver(ABC):
     """
     Turns instances into schedules.
 
-    :cvar uses_time_limit: Whether it may find other schedules with another time limit; if not, evaluations at several time
+    :ivar uses_time_limit: Whether it may find other schedules with another time limit; if not, evaluations at several time
         limits run it once
     :ivar name: How tables and files call it
     :ivar spec: The text that :func:`make_solver` made it from
     :ivar files: Files that it was made from, by their purpose; evaluations record their hashes
     """
 
-    uses_time_limit: ClassVar[bool] = True
+    uses_time_limit: bool = True
     name: str
     spec: str | None = None
     files: Mapping[str, Path] = {}
@@ -230,9 +230,9 @@ def _parse_value(what: str, value: str, kind: type) -> Any:
     :raises ValueError: If the text is not of that type
     """
     if kind is bool:
-        if value.lower() not in ("true", "false"):
-            raise ValueError(f"{what} must be true or false.")
-        return value.lower() == "true"
+        if value.lower() not in ("true", "false", "1", "0"):
+            raise ValueError(f"{what} must be true or false, or 1 or 0.")
+        return value.lower() in ("true", "1")
     try:
         return kind(value)
     except ValueError as error:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances
+from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances, UniformGenerator
 from sb3_uav.envs.schedule import Schedule, ScheduleReport, check_schedule
 from sb3_uav.solvers import kernels
 from sb3_uav.solvers.kernels import AnnealingSettings, Plan
@@ -142,6 +142,15 @@ class LocalSearch:
             kernels.anneal(plan, best, n_trials, progress, min(progress + chunk / seconds, 1.0), settings)
             then, now = now, time.perf_counter()
             n_trials = max(1, int(n_trials * min(CHUNK_SECONDS / max(now - then, 1e-9), 4.0)))
+
+
+def warm_up() -> None:
+    """
+    Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
+    """
+    instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
+    search = LocalSearch(instance)
+    search.repair(search.improve(Schedule([]), seconds=CHUNK_SECONDS / 10))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
