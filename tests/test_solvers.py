@@ -368,8 +368,13 @@ def test_defaults_are_for_solvers_that_have_them() -> None:
         ("kmeans-nearest:restarts=__import__('os')", "must be of type int"),
         ("kmeans-nearest:restarts=1,restarts=2", "given the option 'restarts' twice"),
         ("kmeans-nearest:restarts=0", "at least 1 start"),
-        ("dl-drl", r"'dl-drl' needs the option allocator=<str>; it has: allocator=<str>, batch_size=<int>, decode=<str>"),
-        ("dl-drl:allocator=a.zip", "'dl-drl' needs the option router=<str>"),
+        (
+            "dl-drl:allocator=a.zip",
+            r"a\.zip is one zip of a pair, and its router is missing: give both, or the name of a pair",
+        ),
+        ("dl-drl:router=r.zip", r"r\.zip is one zip of a pair, and its allocator is missing"),
+        ("dl-drl:polish=-1", "polish is -1; give a number of seconds"),
+        ("dl-drl:time_limit=0", "time_limit of DL-DRL .greedy. is 0 seconds"),
         ("dl-drl-i:allocator=a.zip,router=r.zip,batch_size=few", "must be of type int"),
         ("kmeans-am:restarts=2", "'kmeans-am' needs the option router=<str>"),
     ],
@@ -391,5 +396,5 @@ def test_typed_options(monkeypatch: pytest.MonkeyPatch) -> None:
     solver: Any = make_solver("typed:number=1e-3,flag=true,text=a=b")
     # As JSON, because there True is not 1.
     assert json.dumps(solver.options) == json.dumps(dict(number=1e-3, flag=True, text="a=b"))
-    with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false"):
+    with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false, or 1 or 0"):
         make_solver("typed:flag=yes")

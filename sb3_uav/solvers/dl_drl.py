@@ -184,16 +184,14 @@ class DLDRL(BatchedSolver):
         """
         n_tours = min(N_TOURS, self.samples)
         n_allocations = self.samples // n_tours
-        n_views = min(N_VIEWS, n_allocations)
-        n_rounds = -(-n_allocations // n_views)
-        for n_round in range(n_rounds):
-            for first in range(0, n_views, HURRIED_VIEWS if hurry else n_views):
-                numbers = range(first, min(first + HURRIED_VIEWS if hurry else n_views, n_views))
-                blocks = []
-                for i, row in enumerate(rows):
-                    generator = random_generator(instances, seed, row, n_round, first)
-                    blocks.append(self._look(instances[i], numbers, n_round > 0, n_tours, generator))
-                yield Block.concatenate(blocks)
+        size = HURRIED_VIEWS if hurry else N_VIEWS
+        for first in range(0, n_allocations, size):
+            views = [number % N_VIEWS for number in range(first, min(first + size, n_allocations))]
+            blocks = []
+            for i, row in enumerate(rows):
+                generator = random_generator(instances, seed, row, first)
+                blocks.append(self._look(instances[i], views, first >= N_VIEWS, n_tours, generator))
+            yield Block.concatenate(blocks)
 
     def _look(self, instance: Instances, views: Sequence[int], sampled: bool, n_tours: int, generator: th.Generator) -> Block:
         """
