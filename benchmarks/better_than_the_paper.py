@@ -19,11 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_uav.reinforce.baselines import student_t_quantile
 from sb3_uav.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
+from sb3_uav.solvers.comparison import confidence_halfwidth
 
 REFERENCE = "ortools"
-CONFIDENCE = 0.95
 
 # Scenario -> solver -> instance -> objective.
 Objectives = Mapping[tuple[int, int], Mapping[str, Mapping[tuple[str, int], float]]]
@@ -74,11 +73,7 @@ def ratio(ours: Mapping[tuple[str, int], float], reference: Mapping[tuple[str, i
         return np.nan, np.nan, 0
     difference = np.array([ours[place] - reference[place] for place in places])
     mean = float(np.mean([reference[place] for place in places]))
-    width = np.nan
-    if len(places) > 1:
-        error = difference.std(ddof=1) / len(places) ** 0.5
-        width = student_t_quantile((1 + CONFIDENCE) / 2, len(places) - 1) * error / mean
-    return 1.0 + float(difference.mean()) / mean, float(width), len(places)
+    return 1.0 + float(difference.mean()) / mean, confidence_halfwidth(difference) / mean, len(places)
 
 
 def main() -> None:
