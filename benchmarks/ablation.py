@@ -1,9 +1,9 @@
 """
 What each ingredient of the default preset is worth: the same short training without it.
 
-Every variant trains an allocator and a router in turn (the ITS without its first two phases) from scratch, on one scenario and on
-equally many sampled solutions, and is evaluated on the same test instances, greedily and with 32 samples. One run each is a rough
-measure; more seeds make it better.
+Every variant trains an allocator and a router in turn (the ITS without its first two phases) from scratch, on one scenario and
+on equally many sampled solutions, and is evaluated on the same test instances, greedily and with 32 samples. One run each is a
+rough measure; more seeds make it better.
 
     python benchmarks/ablation.py --out ablation.csv
     python benchmarks/ablation.py --out ablation.csv --seeds 1 2 --variants default "no sweep"
