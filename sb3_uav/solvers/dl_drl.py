@@ -84,7 +84,7 @@ class DLDRL(BatchedSolver):
         :return: The same solver with networks of the same architecture that have learned nothing
         """
         allocator, router = freshly_initialised(self.allocator, seed), freshly_initialised(self.router, seed + 1)
-        name = f"DL-DRL untrained ({self._decoding})"
+        name = f"DL-DRL untrained{f' {seed}' if seed else ''} ({self._decoding})"
         return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name)
 
     def check(self, instances: Instances) -> None:
