@@ -100,13 +100,13 @@ def test_seeds_are_averaged() -> None:
 
 
 def test_limits_that_make_no_difference() -> None:
-    """A solver that ignores its time limit is one point, at the shortest time; one failure leaves out that limit only."""
+    """Each is a run of its own, even of the same results; one failure leaves out that limit only."""
     rows = [row("same", limit, i, 5.0 + i, limit) for limit in (3.0, 1.0) for i in range(2)]
     rows += [row("torn", 1.0, 0, 5.0), row("torn", 1.0, 1, None), row("torn", 3.0, 0, 5.0), row("torn", 3.0, 1, 6.0)]
-    rows += [row("never", None, 0, None)]
+    rows += [row("never", None, 0, None), row("fast", None, 0, 5.0), row("fast", None, 1, 6.0)]
     (panel,) = anytime_panels(rows)
-    assert [(curve.solver, len(curve.seconds)) for curve in panel.curves] == [("same", 1), ("torn", 1)]
-    assert panel.curves[0].seconds.tolist() == [1.0]
+    assert [(curve.solver, len(curve.seconds)) for curve in panel.curves] == [("same", 2), ("torn", 1), ("fast", 1)]
+    assert panel.curves[0].seconds.tolist() == [1.0, 3.0]
     assert panel.left_out == ["torn (1 s)", "never"]
 
 

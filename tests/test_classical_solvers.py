@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.solvers import Solver, SolverResult, limits, make_solver, milp, ortools_routing, pyvrp_search
+from sb3_uav.solvers.limits import UnavailableError
 from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
 from sb3_uav.solvers.programs import FREE_LICENCE_SIZE, Answer, Backend
 from sb3_uav.solvers.pyvrp_search import polish_schedule
@@ -165,6 +166,17 @@ def test_the_farthest_reachable_task_is_visited(max_distance: float, angle: floa
     assume(bool(instance.reachable().all()))
     for spec in RELIABLE:
         assert objective(spec, instance) == 1, spec
+
+
+@pytest.mark.parametrize("spec", ["milp", "greedy-insertion", "kmeans-nearest", "kmeans-vnd"])
+@pytest.mark.parametrize("excess", [3.9e-10, 4.3e-10, 4.8e-10, 4.99e-10, 5.01e-10, 6e-10])
+def test_tours_at_the_edge_of_the_tolerance(excess: float, spec: str) -> None:
+    """Who proves bounds must know all tours that others, and the checker, think short enough."""
+    points = [[0.5 * (1 + excess), 0.0], [0.1, 0.0]]
+    instance = Instances.from_arrays([0.0, 0.0], points, max_distance=1.0, n_uavs=1)
+    value, result = solved(spec, instance)
+    assert value == (2.0 if excess < 5e-10 else 1.0)
+    assert result.bound in (None, value)
 
 
 @pytest.mark.parametrize("spec", ALL)
@@ -426,7 +438,7 @@ def test_gurobi_without_a_licence(monkeypatch: pytest.MonkeyPatch, tmp_path: Any
     licence = tmp_path / "gurobi.lic"
     licence.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
     monkeypatch.setenv("GRB_LICENSE_FILE", str(licence))
-    with pytest.raises(ValueError, match=r"Gurobi found no valid licence .* or use milp:backend=highs"):
+    with pytest.raises(UnavailableError, match=r"Gurobi found no valid licence .* or use milp:backend=highs"):
         make_solver("milp:backend=gurobi")
 
 
@@ -447,7 +459,21 @@ def test_prizes(instance: Instances, finest: int, bits: int) -> None:
     assert (np.diff(by_value) >= 0).all()
 
 
-@pytest.mark.parametrize("values, ratios", [([3, 3, 3], [1, 1, 1]), ([0.1, 0.1, 0.1], [1, 1, 1]), ([2, 4, 10], [1, 2, 5])])
+@pytest.mark.parametrize(
+    "values, ratios",
+    [
+        ([3, 3, 3], [1, 1, 1]),
+        ([0.1, 0.1, 0.1], [1, 1, 1]),
+        ([2, 4, 10], [1, 2, 5]),
+        # Of two small tasks and a great one of the same value, the shorter tour must win.
+        ([0.5, 1.5, 1.0], [1, 3, 2]),
+        ([0.1, 0.3, 0.7], [1, 3, 7]),
+        ([0.2, 0.3, 0.5], [2, 3, 5]),
+        # Too fine: rounded, but never to nothing.
+        ([1, 1000.4, 2000], [1, 500, 1000]),
+        ([1e-9, 1e30, 5e29], [1, 1000, 500]),
+    ],
+)
 def test_prizes_in_exact_proportion(values: list[float], ratios: list[int]) -> None:
     instance = Instances.from_arrays([0.0, 0.0], [[0.1, 0.0]] * 3, values, 2.0, 2)
     prizes = ReducedInstance.of(instance).integer_prizes(1000, 2**60)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 import types
@@ -186,6 +187,15 @@ def test_seed_and_batch_size(inputs: Inputs, tmp_path: Path) -> None:
     assert schedules("c", "--seed", 4) != first
 
 
+def test_untrained_networks_of_several_seeds(inputs: Inputs, tmp_path: Path) -> None:
+    """They are different solvers, and may stand in the same folder."""
+    for seed in (0, 1):
+        assert run(*inputs.pair, "--untrained", "--instances", inputs.small, "--out", tmp_path, "--seed", seed) == 0
+    rows = [(row["solver"], row["seed"]) for row in read_results(tmp_path) if row["instance"] == "0"]
+    untrained = [("DL-DRL untrained (greedy)", "0"), ("DL-DRL untrained 1 (greedy)", "1")]
+    assert rows == [("DL-DRL (greedy)", "0"), ("DL-DRL (greedy)", "1"), *untrained]
+
+
 def test_infeasible_schedules_set_the_exit_code(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -264,7 +274,8 @@ def test_zips_of_other_parameters_are_not_mixed_up(inputs: Inputs, tmp_path: Pat
         REINFORCE(RouterPolicy, env, policy_kwargs=dict(TINY), seed=seed, device="cpu").save(router)
         if seed == 1:
             assert run(*arguments) == run(*arguments) == 0
-    assert "holds results of another 'AM', whose router was" in user_error(capsys, *arguments)
+    message = user_error(capsys, *arguments)
+    assert re.search(r"holds results of another 'AM', whose router was '[0-9a-f]{8}' and not '[0-9a-f]{8}'; give it", message)
     assert run(*arguments, "--overwrite") == 0
 
 
@@ -297,6 +308,53 @@ def test_solvers_that_fail_leave_the_others(
         *[("random-nearest", "U3-N20")] * 4,
         ("random-nearest", "U5"),
     ]
+
+
+def test_gurobi_without_a_licence(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The others are evaluated."""
+    pytest.importorskip("gurobipy")
+    licence = tmp_path / "gurobi.lic"
+    licence.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
+    monkeypatch.setenv("GRB_LICENSE_FILE", str(licence))
+    arguments = ("--instances", inputs.small, "--out", tmp_path / "out", "--time-limit", 1)
+    assert run(*arguments, "--solvers", "random-nearest", "milp:backend=gurobi,name=exact") == 3
+    assert "sb3-uav: exact failed on 4 of 4 instances of U3-N20: Gurobi found no valid licence" in capsys.readouterr().err
+    assert [row["status"] for row in read_results(tmp_path / "out")] == ["ok"] * 4 + ["failed"] * 4
+
+
+@pytest.mark.parametrize("solver", ["pyvrp", "ortools", "ortools-gls", "milp", "kmeans-vnd"])
+def test_a_package_that_goes_and_comes_back(
+    solver: str, inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A solver has the same name and the same time limits without its package: nothing is lost, nothing stays failed."""
+    packages = {"pyvrp": "pyvrp", "milp": "highspy", "kmeans-vnd": "numba"}
+    common = ("--instances", inputs.small, "--out", tmp_path, "--time-limit", 0.05, "--reference", "best")
+    arguments = (*common, "--solvers", f"{solver}:name=best", "random-nearest")
+
+    def statuses() -> list[str]:
+        return [row["status"] for row in read_results(tmp_path) if row["solver"] == "best"]
+
+    with monkeypatch.context() as context:
+        context.setitem(sys.modules, packages.get(solver, "ortools.constraint_solver.pywrapcp"), None)
+        assert run(*arguments) == 3
+        assert "sb3-uav: best failed on 4 of 4 instances" in (message := capsys.readouterr().err)
+        assert "pip install 'sb3-uav[solvers]'" in message and statuses() == ["failed"] * 4
+    assert run(*arguments) == 0 and statuses() == ["ok"] * 4
+    with monkeypatch.context() as context:
+        context.setitem(sys.modules, packages.get(solver, "ortools.constraint_solver.pywrapcp"), None)
+        assert run(*arguments) == 0 and statuses() == ["ok"] * 4
+
+
+def test_a_solver_of_which_nothing_was_known(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failures at a time limit do not outlive that the solver turns out to use none."""
+    monkeypatch.setitem(SOLVERS, "late", "a_module_that_is_not_installed:Solver")
+    arguments = ("--instances", inputs.small, "--out", tmp_path, "--time-limit", 1, "--solvers", "late", "random-nearest")
+    assert run(*arguments) == 3
+    monkeypatch.setitem(SOLVERS, "late", SOLVERS["random-nearest"])
+    assert run(*arguments) == 0
+    assert [row["status"] for row in read_results(tmp_path)] == ["ok"] * 8
 
 
 def test_wrong_schedules_count_more_than_failures(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -452,7 +510,7 @@ def test_help_of_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
         "results.csv",
         "summary.json",
         "exit code:",
-        "  3    a solver is not installed",
+        "  3    a solver or its licence is missing",
         "dl-drl-i:",
     ):
         assert word in text

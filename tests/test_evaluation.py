@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -552,6 +553,14 @@ def test_wrong_solvers_and_sets(instances: Instances, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message):
             evaluate(solvers, sets, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_instances_that_nobody_checked(instances: Instances, tmp_path: Path) -> None:
+    """The constructor of instances lets through what no sum can be made of."""
+    huge = replace(instances, values=instances.values * 1e308)
+    with pytest.raises(ValueError, match=r"^instances: field 'values' .* must be finite"):
+        evaluate([Stub()], huge, tmp_path / "never")
+    assert not (tmp_path / "never").exists()
 
 
 def test_names_of_the_reference() -> None:

@@ -164,6 +164,7 @@ def test_make_generator(tmp_path: Path, small: Instances) -> None:
         (poked("values", (1, 1), -np.inf), r"field 'values' holds -inf at index \(1, 1\)"),
         (poked("values", (1, 1), -0.5), r"field 'values' holds -0\.5 at index \(1, 1\); task values must be >= 0"),
         (poked("max_distance", (1,), np.nan), r"field 'max_distance' holds nan at index \(1,\)"),
+        ({"values": np.full((2, 3), 3e38)}, r"field 'values' adds up to 6e\+38 in instance 0; .* finite in float32"),
         (poked("max_distance", (1,), 0.0), r"field 'max_distance' is 0\.0 in instance 1; .* must be > 0"),
         (poked("max_distance", (0,), -2.0), r"field 'max_distance' is -2\.0 in instance 0"),
         (poked("max_distance", (0,), 1e-60), r"field 'max_distance' is 1e-60 in instance 0; .* must be > 0"),

@@ -7,6 +7,8 @@ import math
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import ClusteredGenerator, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import InfeasibleScheduleError
-from sb3_uav.solvers import kernels, make_solver
+from sb3_uav.solvers import base, kernels, kmeans_vnd, local_search, make_solver
 from sb3_uav.solvers.heuristics import kmeans
 from sb3_uav.solvers.local_search import LocalSearch, improve, repair, repair_best
 
@@ -137,6 +139,30 @@ def test_shortening_keeps_the_books(seed: int, n_uavs: int, n_near: int) -> None
     assert (lengths.sum() < before - 1e-12) if changed else (lengths.sum() == before)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_values_that_differ_by_rounding(seed: int) -> None:
+    """Sums of such values differ by the order of their terms; searches that took that for gains went round in circles."""
+    rng = np.random.default_rng(seed)
+    points, values = rng.random((61, 2)), np.where(rng.random(60) < 0.5, 0.3, 0.1 + 0.2)
+    instance = Instances.from_arrays(points[0], points[1:], values, n_uavs=2)
+    plan = LocalSearch(instance)._load(Schedule([]))
+    n_rounds = next(n for n in range(500) if not kernels.descend(plan, 10, 16, 3))
+    assert n_rounds > 1
+    for max_string in (0, 3):
+        repaired = repair(instance, Schedule([]), max_string=max_string)
+        assert repair(instance, repaired, max_string=max_string) == repaired
+    assert rank(instance, improve(instance, repaired, seconds=0.01)) >= rank(instance, repaired)
+
+
+def test_values_of_very_different_sizes() -> None:
+    """Small values count beside great ones, and beside greater ones that no UAV can reach."""
+    points, values = [[0, 0.1], [0.1, 0], [0.1, 0.1], [9, 9]], [1e-300, 1e-9, 1, 1e30]
+    instance = Instances.from_arrays([0, 0], points, values, max_distance=2.0, n_uavs=1)
+    assert sorted(repair(instance, Schedule([])).routes[0]) == [0, 1, 2]
+    near = Instances.from_arrays([0, 0], [[0, 0.5], [0.5, 0], [9, 9]], [1e-9, 2e-9, 1e9], max_distance=1.0, n_uavs=1)
+    assert repair(near, Schedule([[0]])) == Schedule([[1]])
+
+
 def test_distances_at_the_limit() -> None:
     """A tour of exactly the longest length is feasible, for the kernels as for the checker."""
     instance = Instances.from_arrays([0.1, 0.1], [[0.1, 0.4], [0.4, 0.1], [0.1, 0.5]], max_distance=0.6, n_uavs=1)
@@ -236,11 +262,22 @@ def test_improvement_beats_repair(valued: bool) -> None:
 
 
 def test_improvement_in_time() -> None:
-    """A moment is enough to get at least as far as one repair."""
+    """Even without any time it gets at least as far as one repair."""
     instance = medium()
+    repaired = repair(instance, Schedule([]))
     for seconds in (0.0, 1e-6, 0.1):
         improved = improve(instance, Schedule([]), seconds)
-        assert rank(instance, improved)[0] > 0
+        assert rank(instance, improved) >= rank(instance, repaired)
+
+
+@pytest.mark.parametrize("given", [None, 0.0])
+def test_the_last_repair_ends(given: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long it would go on, if there was a time limit at all."""
+    rounds = iter(range(40))
+    monkeypatch.setattr(kernels, "descend", lambda *_: next(rounds) < 30)
+    monkeypatch.setattr(local_search, "LAST_REPAIR_SECONDS", 0.0)
+    improve(medium(), Schedule([]), given)
+    assert next(rounds) == (31 if given is None else 0)
 
 
 def test_random_numbers() -> None:
@@ -305,6 +342,39 @@ def test_kmeans_vnd_gains() -> None:
     assert value["kmeans-vnd"] > 1.1 * value["kmeans-nearest"]
 
 
+def test_loading_the_code_takes_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once in a process, and before the clock of the first instance starts."""
+    clock = iter(range(100))
+    calls: list[int] = []
+    monkeypatch.setattr(kmeans_vnd, "_warm_up", cache(kmeans_vnd._warm_up.__wrapped__))
+    monkeypatch.setattr(local_search, "warm_up", lambda: calls.append(next(clock)))
+    monkeypatch.setattr(base, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    results = make_solver("kmeans-vnd").solve(UniformGenerator(5, 2)(2, np.random.default_rng(0)))
+    assert calls == [0]
+    assert [result.seconds for result in results] == [1, 1]
+
+
+def test_warm_up() -> None:
+    """K-means+VND loads nothing more after it."""
+    code = """
+from sb3_uav.envs import UniformGenerator
+from sb3_uav.solvers import kernels, make_solver
+import numpy as np
+
+def signatures():
+    return {name: len(f.signatures) for name, f in vars(kernels).items() if hasattr(f, "signatures")}
+
+solver = make_solver("kmeans-vnd")
+solver.prepare()
+before = signatures()
+assert before["descend"] == 1
+solver.solve(UniformGenerator(30, 3)(1, np.random.default_rng(0)))
+assert signatures() == before, (before, signatures())
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_restarts() -> None:
-    with pytest.raises(ValueError, match="at least 1 start"):
-        make_solver("kmeans-vnd:restarts=0")
+    for name in ("kmeans-vnd", "kmeans-nearest"):
+        with pytest.raises(ValueError, match=f"restarts of {name} is 0; K-means needs at least 1 start"):
+            make_solver(f"{name}:restarts=0")

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import multiprocessing
+import re
 import shutil
 import signal
 from collections.abc import Iterator
@@ -35,7 +36,7 @@ from sb3_uav.reproduce.paper import (
     paper_tables,
 )
 from sb3_uav.reproduce.result_figures import read_curves
-from sb3_uav.reproduce.result_tables import phase_times
+from sb3_uav.reproduce.result_tables import phase_times, seconds
 from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
 from sb3_uav.reproduce.tables import Column, Table, best, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.training import Job, TrainingError, train, training_entry
@@ -180,6 +181,11 @@ def test_best_of_what_is_shown() -> None:
     assert best([1.0, 2.001, None, 1.999, float("nan")]) == [1, 3]
     assert best([1.0, 2.0, None], smallest=True) == [0]
     assert best([None, float("nan")]) == []
+    # Small times are shown with more digits than others.
+    times = [0.0012, 0.0038, 0.00119, 0.2]
+    assert best(times, smallest=True, show=seconds) == [0, 2]
+    assert best(times, smallest=True) == [0, 1, 2]
+    assert best([0.12, 0.1234], smallest=True, show=seconds) == [0, 1]
 
 
 def test_a_table_in_three_formats() -> None:
@@ -225,6 +231,52 @@ def test_curves(logged: Model) -> None:
     assert curves["allocator"].minutes.tolist() == pytest.approx([18 / 60, 41 / 60])
     assert curves["router"].n_pretraining == 1 and curves["router"].minutes[-1] == pytest.approx(47 / 60)
     assert curves["router"].generation_minutes == pytest.approx(3 / 60)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("epoch,level\n1,router\n", ": has no column 'n_instances'; give the its_log.csv"),
+        (LOG.replace("18.0", "soon"), r", line 5: is damaged \(could not convert string to float: 'soon'\)"),
+        (LOG.replace("8.0,6.0,2.0", "8.0,6.0,x"), r", line 6: is damaged \(could not convert string to float: 'x'\)"),
+        (LOG + "4,router,alt", r", line 7: is damaged"),
+        (LOG.replace("2,allocator,alternate,100", "2,allocator,alternate,0"), r", line 5: .* n_instances 0\)"),
+        (LOG.replace("3,router", "3,other"), r", line 6: .*level 'other'"),
+        (b"\xff\xfe", ": is no log of a training"),
+    ],
+)
+def test_damaged_logs(content: str | bytes, message: str, logged: Model) -> None:
+    assert logged.its_log is not None
+    logged.its_log.write_bytes(content.encode() if isinstance(content, str) else content)
+    for read in (lambda: phase_times(logged), lambda: read_curves(logged.folder / "its_log.csv")):
+        with pytest.raises(ValueError, match=re.escape(str(logged.its_log)) + message):
+            read()
+
+
+def given_pair(models: Path, log: str, folder: str = "U4-N80/ITS") -> None:
+    """What is looked for in a folder of --models; the zips need not be any as long as none is loaded."""
+    for name, text in (("allocator.zip", ""), ("router.zip", ""), ("its_log.csv", log)):
+        (models / folder).mkdir(parents=True, exist_ok=True)
+        (models / folder / name).write_text(text)
+
+
+def test_table1_of_own_pairs(tmp_path: Path) -> None:
+    """Also at the scale that has trainings of its own for it."""
+    given_pair(tmp_path / "mine", LOG)
+    arguments = ("--scale", "cpu", "--models", tmp_path / "mine", "--no-training", "--out", tmp_path / "out")
+    assert run("table1", *arguments) == 0
+    _, rows, comments = read_table(tmp_path / "out" / "table1.csv")
+    (measured,) = [row for row in rows if row[f"{PHASES[0]}: ours"]]
+    assert measured["Situation"] == "U4-80" and float(measured[f"{PHASES[0]}: ours"]) > 0
+    assert any("given pairs (--models): U4-80." in comment for comment in comments)
+    assert not any("Our runs have the paper's networks" in comment for comment in comments)
+
+
+def test_fig5_without_the_upper_level(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = "".join(line for line in LOG.splitlines(keepends=True) if "allocator" not in line)
+    given_pair(tmp_path / "mine", log)
+    assert run("fig5", "--models", tmp_path / "mine", "--no-training", "--out", tmp_path / "out") == 2
+    assert "U4-N80/ITS/its_log.csv: has no epochs of the allocator" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------------------------------------------------ all nine of them

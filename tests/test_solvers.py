@@ -214,7 +214,7 @@ def test_untrained_networks(instances: Instances) -> None:
     state = th.get_rng_state()
     fresh, again, other = pair.untrained(1), pair.untrained(1), pair.untrained(2)
     assert th.equal(state, th.get_rng_state())
-    assert fresh.name == "DL-DRL untrained (sampling 4)" and pair.name == "DL-DRL (sampling 4)"
+    assert fresh.name == "DL-DRL untrained 1 (sampling 4)" and pair.name == "DL-DRL (sampling 4)"
     for level in ("allocator", "router"):
         trained = getattr(pair, level).state_dict()
         initial = getattr(fresh, level).state_dict()

@@ -123,9 +123,9 @@ class Instances:
         """
         Check the contents.
 
-        :raises ValueError: On NaN or infinite numbers, a negative value, ``max_distance <= 0``, fewer than one UAV, padding
-            that is not at the end of its row, or another dtype than float64; the message names the field, the row and the
-            value found
+        :raises ValueError: On NaN or infinite numbers, a negative value, values whose sum is infinite, ``max_distance <= 0``,
+            fewer than one UAV, padding that is not at the end of its row, or another dtype than float64; the message names
+            the field, the row and the value found
         """
         if self.task_mask.dtype != th.bool:
             raise ValueError(f"field 'task_mask' has dtype {self.task_mask.dtype}; it must be bool.")
@@ -149,6 +149,14 @@ class Instances:
         if (self.values < 0).any():
             where = tuple(int(i) for i in (self.values < 0).nonzero()[0])
             raise ValueError(f"field 'values' holds {self.values[where].item()} at index {where}; task values must be >= 0.")
+        total = (self.values * self.task_mask).sum(1)
+        too_great = ~th.isfinite(total.float())
+        if too_great.any():
+            row = int(too_great.nonzero()[0, 0])
+            found = total[row].item()
+            raise ValueError(
+                f"field 'values' adds up to {found:g} in instance {row}; the sum must be finite in float32; divide them all."
+            )
         if (self.task_mask[:, 1:] & ~self.task_mask[:, :-1]).any():
             raise ValueError("field 'task_mask' marks a real task after a padded one; put the padding at the end of each row.")
 

@@ -130,9 +130,6 @@ def _panel(rows: Sequence[ResultRow]) -> Panel:
             (_mean_seconds(runs[key]), float(objectives[key].mean()), confidence_halfwidth(best - objectives[key]))
             for key in keys
         )
-        if len({objectives[key].tobytes() for key in keys}) == 1:
-            # Time limits made no difference: it uses none.
-            points = points[:1]
         seconds, objective, halfwidth = np.array(points).T
         batch_size = max(row.batch_size or 1 for key in keys for row in runs[key])
         curves.append(Curve(solver, seconds, objective, halfwidth, batch_size))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import multiprocessing
 import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
@@ -28,6 +29,7 @@ from sb3_uav.reproduce.training import (
 )
 
 ITS, INDEPENDENT = "ITS", "independent"
+LEVELS = ("allocator", "router")
 # Folders of the strategies; those of the ablation without what their names say.
 STRATEGY_FOLDERS = {
     ITS: "ITS",
@@ -36,6 +38,8 @@ STRATEGY_FOLDERS = {
     "ITS/pre-training&intensive": "ITS-without-both",
     INDEPENDENT: "independent",
 }
+# What has to be in every line of a log.
+LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
 # Seconds between two looks at the logs of running trainings.
 POLL_INTERVAL = 1.0
 
@@ -69,6 +73,33 @@ class Model:
         """The log of its training, if there is one."""
         path = self.folder / ITS_LOG
         return path if path.is_file() else None
+
+
+def read_log(its_log: Path) -> list[dict[str, str]]:
+    """
+    :param its_log: The ``its_log.csv`` of a training
+    :return: Its lines, one for every epoch
+    :raises ValueError: If it is something else; the message names file and line
+    """
+    remedy = f"give the {ITS_LOG} that the training wrote, or take the file away"
+    try:
+        with its_log.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{its_log}: is no log of a training ({error}); {remedy}.") from error
+    for number, row in enumerate(rows, start=2):
+        try:
+            for column, kind in LOG_COLUMNS.items():
+                kind(row[column])
+            # Earlier versions did not write it.
+            float(row.get("generation_seconds") or 0.0)
+            if row["level"] not in LEVELS or not row["phase"] or int(row["n_instances"]) < 1:
+                raise ValueError(f"level {row['level']!r}, phase {row['phase']!r}, n_instances {row['n_instances']}")
+        except KeyError as error:
+            raise ValueError(f"{its_log}: has no column {error}; {remedy}.") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{its_log}, line {number}: is damaged ({error}); {remedy}.") from error
+    return rows
 
 
 class Models:
@@ -118,6 +149,12 @@ class Models:
         :raises TrainingError: If a training fails
         :raises KeyboardInterrupt: If a training is interrupted
         """
+        return self._find(self.scale.recipe, "models", wanted, log_needed)
+
+    def _find(
+        self, recipe: Recipe, kind: str, wanted: Iterable[tuple[Scenario, str]], log_needed: bool
+    ) -> dict[tuple[Scenario, str], Model]:
+        """The user's own pairs, and those that are trained with a recipe; see :meth:`get`."""
         found: dict[tuple[Scenario, str], Model] = {}
         jobs: dict[tuple[Scenario, str], Job] = {}
         for scenario, strategy in wanted:
@@ -125,7 +162,7 @@ class Models:
             if model is not None and (model.its_log is not None or not log_needed):
                 found[scenario, strategy] = model
             else:
-                jobs[scenario, strategy] = self._job(self.scale.recipe, "models", scenario, strategy)
+                jobs[scenario, strategy] = self._job(recipe, kind, scenario, strategy)
         return found | self._trained(jobs)
 
     def timed(self, wanted: Iterable[Scenario]) -> dict[Scenario, Model]:
@@ -138,7 +175,7 @@ class Models:
             trained = [scenario for scenario in wanted if scenario.n_tasks in self.scale.trained_sizes]
             models = self.get([(scenario, ITS) for scenario in trained], log_needed=True)
         else:
-            models = self._trained({(scenario, ITS): self._job(recipe, "timing", scenario, ITS) for scenario in wanted})
+            models = self._find(recipe, "timing", [(scenario, ITS) for scenario in wanted], log_needed=True)
         return {scenario: model for (scenario, _), model in models.items()}
 
     def _given(self, scenario: Scenario, strategy: str) -> Model | None:

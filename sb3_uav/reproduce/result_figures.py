@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from sb3_uav.envs.schedule import check_schedule
 from sb3_uav.plots.figures import new_figure
 from sb3_uav.plots.schedule_map import MapPanel, schedules_figure
 from sb3_uav.reproduce.evaluations import complete
-from sb3_uav.reproduce.models import INDEPENDENT, ITS, Model
+from sb3_uav.reproduce.models import INDEPENDENT, ITS, LEVELS, Model, read_log
 from sb3_uav.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
@@ -35,7 +34,6 @@ from sb3_uav.solvers.results import replaced_when_complete
 
 MAPS_PER_LINE = 3
 MARKERS = ("o", "s", "^", "D", "v", "P")
-LEVELS = ("allocator", "router")
 LEVEL_TITLES = {"allocator": "Upper level", "router": "Lower level"}
 STRATEGY_TITLES = {"ITS": "ITS (ours)"}
 CURVES_SUFFIX = "_curves.csv"
@@ -65,9 +63,9 @@ def read_curves(its_log: Path) -> dict[str, Curve]:
     """
     :param its_log: The ``its_log.csv`` of a training, whose lines stand in the order of time
     :return: The curves of both levels
+    :raises ValueError: If it is something else
     """
-    with its_log.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_log(its_log)
     minutes = np.cumsum([float(row["seconds"]) for row in rows]) / 60
     generation = sum(float(row.get("generation_seconds") or 0.0) for row in rows) / 60
     curves = {}
@@ -232,6 +230,9 @@ def fig5(session: Session) -> list[Path]:
     table = Table("Fig. 5: Ablation study results of ITS", [Column(title) for title in titles])
     for strategy, levels in curves.items():
         upper = levels["allocator"]
+        if len(upper.cost) == 0:
+            log = models[scenario, strategy].its_log
+            raise ValueError(f"{log}: has no epochs of the allocator; give the log of a whole training, or take it away.")
         minutes = max(curve.minutes[-1] for curve in levels.values() if len(curve.minutes) > 0)
         costs = [number(float(cost)) for cost in (upper.cost[0], upper.cost.min(), upper.cost[-1])]
         table.add([strategy, str(len(upper.cost)), *costs, number(float(minutes), 3), number(upper.generation_minutes, 3)])

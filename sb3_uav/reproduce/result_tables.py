@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.reproduce.evaluations import BASELINES, complete
-from sb3_uav.reproduce.models import INDEPENDENT, ITS, Model
+from sb3_uav.reproduce.models import INDEPENDENT, ITS, Model, read_log
 from sb3_uav.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
@@ -82,7 +81,11 @@ def table1(session: Session) -> list[Path]:
         "measured over fewer instances and multiplied; the first epoch, whose baseline is cheaper, is left out.",
         "Lower-level and data generation: epochs of the alternate phase, where an epoch's subsets are all generated anew.",
     )
-    if session.scale.timing is not None:
+    given = session.models.given
+    own = [scenario.name for scenario, model in models.items() if given is not None and model.folder.is_relative_to(given)]
+    if own:
+        notes.add(f"Trainings of the given pairs (--models): {', '.join(own)}.")
+    if session.scale.timing is not None and len(own) < len(models):
         notes.add(f"Our runs have the paper's networks and baseline, but batches of {_batch_size(session)} instances.")
     notes.add_stand_ins(session.scale, [])
     measured: dict[int, list[str]] = {}
@@ -115,10 +118,10 @@ def phase_times(model: Model) -> PhaseTimes:
     """
     :param model: A trained pair with the log of its training
     :return: How long the phases of an epoch took
+    :raises ValueError: If the log is something else
     """
     assert model.its_log is not None
-    with model.its_log.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_log(model.its_log)
     upper = [row for row in rows if row["level"] == "allocator"]
     upper = upper[1:] or upper
     alternate = [row for row in rows if row["level"] == "router" and row["phase"] == "alternate"]
@@ -369,9 +372,9 @@ def table4(session: Session) -> list[Path]:
                 for size in LARGER_SIZES:
                     figures = found[source][size]
                     for measure in ("objective", "seconds"):
-                        if position in best(figures[measure], smallest=measure == "seconds"):
-                            bold.append(len(cells))
                         show = seconds if measure == "seconds" and source == OURS else number
+                        if position in best(figures[measure], measure == "seconds", show):
+                            bold.append(len(cells))
                         cells.append(show(figures[measure][position]))
                 table.add(cells, [column for column in bold if cells[column] != MISSING])
     _say_how_exact(errors, notes)

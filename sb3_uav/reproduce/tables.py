@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -78,18 +78,18 @@ def number(value: float | None, digits: int = 2) -> str:
     return MISSING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
-def best(values: Sequence[float | None], smallest: bool = False) -> list[int]:
+def best(values: Sequence[float | None], smallest: bool = False, show: Callable[[float | None], str] = number) -> list[int]:
     """
     :param values: Numbers; None or NaN where there is none
     :param smallest: Whether the smallest is the best
-    :return: Indices of the best, several if equal to two digits as tables show them
+    :param show: How the table shows them
+    :return: Indices of the best, several if the table shows them alike
     """
-    shown = [None if value is None or math.isnan(value) else round(value, 2) for value in values]
-    known = [value for value in shown if value is not None]
+    known = [value for value in values if value is not None and not math.isnan(value)]
     if not known:
         return []
-    target = min(known) if smallest else max(known)
-    return [index for index, value in enumerate(shown) if value == target]
+    target = show(min(known) if smallest else max(known))
+    return [index for index, value in enumerate(values) if show(value) == target]
 
 
 def to_markdown(table: Table, about: Sequence[str]) -> str:

@@ -66,6 +66,12 @@ class Solver(ABC):
         :raises ValueError: If the solver cannot treat them; the message says why
         """
 
+    def prepare(self) -> None:  # noqa: B027 (most solvers have nothing to prepare)
+        """
+        Called in every process before it solves an instance, often more than once; what it takes does not count as time of the
+        instance. For what is the same for all of them, such as loading code.
+        """
+
     @abstractmethod
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         """
@@ -126,6 +132,7 @@ class OneByOneSolver(Solver):
         :param seed: As for :meth:`solve`
         :return: What :meth:`solve` finds for that row
         """
+        self.prepare()
         start = time.perf_counter()
         # A row that is all padding keeps one slot, because no instance has none.
         trimmed = instance.trim(max(int(instance.task_mask.sum()), 1))
@@ -171,26 +178,43 @@ def make_solver(spec: str, **defaults: Any) -> Solver:
     :raises ValueError: If the name, a key or a value is not allowed; the message lists the choices
     :raises ImportError: If the solver needs a package that is not installed
     """
+    factory = solver_factory(spec)
     name, _, text = spec.partition(":")
-    if name not in SOLVERS:
-        raise ValueError(f"Unknown solver {name!r}; choose one of {sorted(SOLVERS)}.")
-    module, _, attribute = SOLVERS[name].partition(":")
-    factory: Callable[..., Solver] = getattr(import_module(module), attribute)
-    options, label = _parse_options(name, text, factory, defaults)
-    solver = factory(**options)
-    solver.name, solver.spec = label or spec, spec
+    solver = factory(**_parse_options(name, text, factory, defaults))
+    solver.name, solver.spec = solver_label(spec), spec
     return solver
 
 
-def _parse_options(
-    name: str, text: str, factory: Callable[..., Solver], defaults: Mapping[str, Any]
-) -> tuple[dict[str, Any], str]:
+def solver_factory(spec: str) -> Callable[..., Solver]:
+    """
+    :param spec: As of :func:`make_solver`
+    :return: The class of the solver, or the function that makes it
+    :raises ValueError: If there is no such solver
+    :raises ImportError: If the module that it is in, or what that module imports, is not installed
+    """
+    name = spec.partition(":")[0]
+    if name not in SOLVERS:
+        raise ValueError(f"Unknown solver {name!r}; choose one of {sorted(SOLVERS)}.")
+    module, _, attribute = SOLVERS[name].partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def solver_label(spec: str) -> str:
+    """
+    :param spec: As of :func:`make_solver`
+    :return: What tables and files call the solver: the option ``name``, or the whole text
+    """
+    options = dict(item.partition("=")[::2] for item in spec.partition(":")[2].split(","))
+    return options.get("name") or spec
+
+
+def _parse_options(name: str, text: str, factory: Callable[..., Solver], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param name: Name of the solver, for errors
     :param text: ``key=value,key=value``, or nothing
     :param factory: A class or a function, whose arguments say which keys there are, and of which type
     :param defaults: Arguments where the text does not give them
-    :return: The arguments, and the label that the text gives the solver, if any
+    :return: The arguments
     :raises ValueError: If a key or a value is not allowed, or one is missing
     """
     parameters = inspect.signature(factory, eval_str=True).parameters
@@ -204,12 +228,13 @@ def _parse_options(
         if key in options:
             raise ValueError(f"Solver {name!r} is given the option {key!r} twice.")
         options[key] = _parse_value(f"Option {item!r} of solver {name!r}", value, choices[key])
-    label = options.pop("name", "")
+    # How it is called is no argument of the solver.
+    options.pop("name", None)
     options = {key: value for key, value in defaults.items() if key in parameters} | options
     missing = [key for key, parameter in parameters.items() if parameter.default is parameter.empty and key not in options]
     if missing:
         raise ValueError(f"Solver {name!r} needs the option {missing[0]}=<{choices[missing[0]].__name__}>; it has: {known}.")
-    return options, label
+    return options
 
 
 def _plain_type(hint: Any) -> type:

@@ -112,7 +112,7 @@ class DLDRL(BatchedSolver):
         :return: The same solver with networks of the same architecture that have learned nothing
         """
         allocator, router = freshly_initialised(self.allocator, seed), freshly_initialised(self.router, seed + 1)
-        name = f"DL-DRL untrained ({self._decoding})"
+        name = f"DL-DRL untrained{f' {seed}' if seed else ''} ({self._decoding})"
         refinement = (self.refinement.repair, self.refinement.polish, self.time_limit)
         return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name, *refinement)
 

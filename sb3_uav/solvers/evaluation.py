@@ -12,7 +12,7 @@ from typing import Any
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, ScheduleReport, check_schedule, schedule_to_json
-from sb3_uav.solvers.base import Solver, SolverResult
+from sb3_uav.solvers.base import Solver, SolverResult, solver_factory, solver_label
 from sb3_uav.solvers.comparison import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarise, write_summary
 from sb3_uav.solvers.results import (
     FAILED,
@@ -41,13 +41,21 @@ class UnavailableSolver(Solver):
     """
     Stands for a solver that could not be made, so that the evaluation of the others says so.
 
+    It has the name of that solver, and as far as is known its use of time limits, so that earlier results of that solver are
+    found and later ones take the place of the failures.
+
     :param spec: The text that it should have been made from
     :param reason: Why it could not be
     """
 
     def __init__(self, spec: str, reason: str) -> None:
-        self.name = self.spec = spec
+        self.name, self.spec = solver_label(spec), spec
         self.reason = reason
+        try:
+            self.uses_time_limit = getattr(solver_factory(spec), "uses_time_limit", True)
+        except ImportError:
+            # Not even its class is known.
+            self.uses_time_limit = True
 
     def check(self, instances: Instances) -> None:
         raise ValueError(self.reason)
@@ -163,6 +171,11 @@ def _check_arguments(
             raise ValueError(f"The name {name!r} breaks the line; give another one.")
     if seed < 0:
         raise ValueError(f"The seed is {seed}; it must be at least 0.")
+    for source, batch in sources.items():
+        try:
+            batch.validate()
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
     for time_limit in time_limits:
         # Whether 0 is enough is for the solver to say.
         if time_limit is not None and not 0 <= time_limit < math.inf:

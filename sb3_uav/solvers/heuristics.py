@@ -46,13 +46,23 @@ class KMeansNearest(OneByOneSolver):
     uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
-        if restarts < 1:
-            raise ValueError(f"restarts of kmeans-nearest is {restarts}; K-means needs at least 1 start.")
-        self.restarts = restarts
+        self.restarts = checked_restarts(restarts, self.name)
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
         return Solution(nearest_feasible_schedule(instance, clusters))
+
+
+def checked_restarts(restarts: int, solver: str) -> int:
+    """
+    :param restarts: How many times K-means starts
+    :param solver: Name of the solver, for errors
+    :return: The same
+    :raises ValueError: If it is less than 1
+    """
+    if restarts < 1:
+        raise ValueError(f"restarts of {solver} is {restarts}; K-means needs at least 1 start.")
+    return restarts
 
 
 def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restarts: int = 10) -> np.ndarray:

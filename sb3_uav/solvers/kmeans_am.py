@@ -15,7 +15,7 @@ from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.solvers.batched import BatchedSolver, parameters_hash
-from sb3_uav.solvers.heuristics import kmeans
+from sb3_uav.solvers.heuristics import checked_restarts, kmeans
 
 
 class KMeansAM(BatchedSolver):
@@ -34,10 +34,8 @@ class KMeansAM(BatchedSolver):
 
     def __init__(self, router: RouterPolicy, restarts: int = 10, batch_size: int | None = None) -> None:
         super().__init__(batch_size)
-        if restarts < 1:
-            raise ValueError(f"restarts of kmeans-am is {restarts}; K-means needs at least 1 start.")
         self.router = router
-        self.restarts = restarts
+        self.restarts = checked_restarts(restarts, "kmeans-am")
 
     def settings(self) -> dict[str, Any]:
         return {"router": parameters_hash(self.router), "restarts": self.restarts}

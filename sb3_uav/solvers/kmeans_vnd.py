@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.heuristics import kmeans, nearest_feasible_schedule
-from sb3_uav.solvers.local_search import LocalSearch
+from sb3_uav.solvers.heuristics import checked_restarts, kmeans, nearest_feasible_schedule
+from sb3_uav.solvers.limits import require
 
 
 class KMeansVND(OneByOneSolver):
@@ -30,14 +31,24 @@ class KMeansVND(OneByOneSolver):
     uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
-        if restarts < 1:
-            raise ValueError(f"restarts of kmeans-vnd is {restarts}; K-means needs at least 1 start.")
-        self.restarts = restarts
+        self.restarts = checked_restarts(restarts, self.name)
+        require("numba", self.name)
+
+    def prepare(self) -> None:
+        _warm_up()
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
         start = nearest_feasible_schedule(instance, clusters)
         return Solution(Schedule(descend(instance, clusters == uav, route) for uav, route in enumerate(start.routes)))
+
+
+@cache
+def _warm_up() -> None:
+    """Once in a process. Imported when needed, because numba may be missing and this class is told of even then."""
+    from sb3_uav.solvers.local_search import warm_up
+
+    warm_up()
 
 
 def descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tuple[int, ...]:
@@ -50,6 +61,8 @@ def descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tu
     tasks = np.flatnonzero(mine)
     if len(tasks) == 0:
         return ()
+    from sb3_uav.solvers.local_search import LocalSearch
+
     alone = replace(
         instance,
         tasks=instance.tasks[:, tasks],

@@ -10,7 +10,11 @@ from types import ModuleType
 from sb3_uav.solvers.base import OneByOneSolver
 
 
-class TimeLimitError(ValueError):
+class UnavailableError(ValueError):
+    """A solver that cannot be made here or in this time, though its options are right; others may be."""
+
+
+class TimeLimitError(UnavailableError):
     """A time limit that leaves no time, or never ends."""
 
 

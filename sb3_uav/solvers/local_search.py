@@ -11,6 +11,7 @@ from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances, UniformGenerat
 from sb3_uav.envs.schedule import Schedule, ScheduleReport, check_schedule
 from sb3_uav.solvers import kernels
 from sb3_uav.solvers.kernels import AnnealingSettings, Plan
+from sb3_uav.solvers.reduction import USABLE_TOLERANCE
 
 # How many nearest tasks of every task are known.
 N_NEAR = 64
@@ -18,10 +19,13 @@ N_NEAR = 64
 N_NEAR_JOINED, N_NEAR_INSERTED = 10, 16
 # Local search takes strings of at most so many tasks out.
 MAX_STRING = 3
-# Kernels stay below the checker's limit by this part of its tolerance: far more than they can err by, hundreds of legs long.
-MARGIN = 1e-3
+# Kernels know values to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are far
+# above what kernels take for rounding errors of lengths.
+VALUE_BITS = 36
 # Ruin and recreate returns to Python about this often, in seconds, to look at the clock.
 CHUNK_SECONDS = 0.02
+# The repair after it ends at the latest so many seconds after the given time.
+LAST_REPAIR_SECONDS = 1.0
 # Trials per task where no time is given.
 TRIALS_PER_TASK = 100
 
@@ -42,16 +46,18 @@ class LocalSearch:
         self.instance = instance = instance.to("cpu")
         depot, max_distance = instance.depot[0].numpy(), float(instance.max_distance[0])
         points, values = (instance.tasks[0].numpy() - depot) / max_distance, instance.values[0].numpy()
-        limit = 1.0 + DISTANCE_TOLERANCE
-        within_reach = 2.0 * np.hypot(points[:, 0], points[:, 1]) <= limit * (1.0 + DISTANCE_TOLERANCE)
+        within_reach = 2.0 * np.hypot(points[:, 0], points[:, 1]) <= (1.0 + DISTANCE_TOLERANCE) ** 2
         self._tasks = np.flatnonzero(instance.task_mask[0].numpy() & (values > 0) & within_reach)
         self._nodes = np.zeros(len(self._tasks) + 1, kernels.NODE)
         self._nodes["x"][1:], self._nodes["y"][1:] = points[self._tasks].T
-        # Divided by a power of two, which is exact: sums of values near 1 neither vanish nor overflow.
-        self._nodes["value"][1:] = np.ldexp(values[self._tasks], -np.frexp(values.max(initial=0.0))[1])
+        # In whole multiples of a power of two, so that kernels add them up without rounding errors: else a search that takes
+        # such an error for a gain never ends. At most 1, so that sums neither vanish nor overflow.
+        values = values[self._tasks]
+        scaled = np.ldexp(values, VALUE_BITS - np.frexp(values.max(initial=0.0))[1])
+        self._nodes["value"][1:] = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -VALUE_BITS)
         self._node_of_task = np.zeros(instance.n_tasks, np.int64)
         self._node_of_task[self._tasks] = np.arange(1, len(self._tasks) + 1)
-        self._limit = limit - MARGIN * DISTANCE_TOLERANCE
+        self._limit = 1.0 + USABLE_TOLERANCE
         self._near = np.zeros((len(self._nodes), max(min(N_NEAR, len(self._tasks) - 1), 0)), np.int32)
         kernels.find_near(self._nodes, self._near)
 
@@ -119,7 +125,8 @@ class LocalSearch:
             else:
                 self._anneal(plan, best, start, seconds, settings)
         kernels.measure_all(best)
-        while kernels.descend(best, N_NEAR_JOINED, N_NEAR_INSERTED, MAX_STRING):
+        end = start + (np.inf if seconds is None else seconds + LAST_REPAIR_SECONDS)
+        while time.perf_counter() < end and kernels.descend(best, N_NEAR_JOINED, N_NEAR_INSERTED, MAX_STRING):
             pass
         return self._better(self._unload(best), schedule)
 
@@ -150,7 +157,7 @@ def warm_up() -> None:
     """
     instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
     search = LocalSearch(instance)
-    search.repair(search.improve(Schedule([]), seconds=CHUNK_SECONDS / 10))
+    search.repair(search.improve(Schedule([])))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
@@ -159,7 +166,8 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
 
     Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
     wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of
-    tasks out to fill the gap better. Deterministic, and a second repair changes nothing.
+    tasks out to fill the gap better. Deterministic, and a second repair changes nothing. Differences between values below
+    1e-10 of the greatest do not count, but the result is never worse for them.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it
@@ -209,7 +217,8 @@ def improve(instance: Instances, schedule: Schedule, seconds: float | None = Non
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it; an empty one will do
-    :param seconds: Wall time, exceeded only by the last repair; if None, trials in proportion to the number of tasks
+    :param seconds: Wall time, exceeded only by the last repair, whose last round starts within a second; if None, trials in
+        proportion to the number of tasks
     :param seed: Of the random numbers; without ``seconds`` the same seed gives the same schedule
     :return: A feasible schedule that is not worse: of the same value it is not longer
     :raises InfeasibleScheduleError: If the schedule breaks a constraint

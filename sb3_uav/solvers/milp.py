@@ -19,7 +19,7 @@ from sb3_uav.solvers.reduction import ReducedInstance
 # Tasks nearer to each other than this, in units of the maximum flight distance, are one place.
 COINCIDENT = 1e-12
 # By how much a tour may exceed 1: less than the reduction leaves of the checker's tolerance.
-LENGTH_TOLERANCE = 5e-11
+LENGTH_TOLERANCE = 1e-13
 
 
 class Places(NamedTuple):
@@ -77,7 +77,8 @@ class MILP(TimeLimitedSolver):
     :param backend: ``"highs"`` or ``"gurobi"``
     :param threads: How many threads the backend may use
     :raises ImportError: If the backend is not installed
-    :raises ValueError: If an argument is not allowed, or Gurobi finds no valid licence
+    :raises ValueError: If an argument is not allowed
+    :raises UnavailableError: If Gurobi finds no valid licence
     """
 
     name = "milp"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_uav.solvers.limits import require
+from sb3_uav.solvers.limits import UnavailableError, require
 
 # What the solvers are asked to keep to: in constraints, in integers, and between the best value and its bound.
 SOLVER_TOLERANCE = 1e-9
@@ -184,7 +184,7 @@ class HiGHSBackend(Backend):
 class GurobiBackend(Backend):
     """
     :raises ImportError: If gurobipy is not installed
-    :raises ValueError: If Gurobi finds no valid licence
+    :raises UnavailableError: If Gurobi finds no valid licence
     """
 
     def __init__(self) -> None:
@@ -196,13 +196,13 @@ class GurobiBackend(Backend):
                 model.optimize()
             except gurobipy.GurobiError as error:
                 if error.errno != gurobipy.GRB.Error.SIZE_LIMIT_EXCEEDED:
-                    raise ValueError(self._refused(error)) from error
+                    raise self._refused(error) from error
                 self.size_limit = FREE_LICENCE_SIZE
                 self.size_reason = "which is what Gurobi's free licence admits; install another, or use milp:backend=highs"
 
     @staticmethod
-    def _refused(error: Exception) -> str:
-        return f"Gurobi found no valid licence ({error}); install one, or use milp:backend=highs."
+    def _refused(error: Exception) -> UnavailableError:
+        return UnavailableError(f"Gurobi found no valid licence ({error}); install one, or use milp:backend=highs.")
 
     def _start(self) -> tuple[Any, Any]:
         """
@@ -212,7 +212,7 @@ class GurobiBackend(Backend):
         try:
             return gurobipy, gurobipy.Env(params={"OutputFlag": 0})
         except gurobipy.GurobiError as error:
-            raise ValueError(self._refused(error)) from error
+            raise self._refused(error) from error
 
     def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> Answer:
         gurobipy, environment = self._start()

@@ -10,8 +10,12 @@ import numpy as np
 from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances
 from sb3_uav.envs.schedule import Schedule
 
-# Most of the tolerance of the dynamics and of the checker; the rest is left to the rounding of sums of distances.
-USABLE_TOLERANCE = 0.8 * DISTANCE_TOLERANCE
+# Solvers leave this part of the tolerance of the dynamics and of the checker to the rounding of sums of distances: far more
+# than they can err by, hundreds of legs long.
+MARGIN = 1e-3
+USABLE_TOLERANCE = (1.0 - MARGIN) * DISTANCE_TOLERANCE
+# Rounding of values that are multiples of one another, as a part of them.
+MULTIPLE_TOLERANCE = 1e-12
 # The maximum flight distance in integers. Even, so that rounding up never forbids a flight to a reachable task.
 RESOLUTION = 2_000_000
 
@@ -87,8 +91,9 @@ class ReducedInstance:
         """
         Prizes in units of distance, so that any gain of value outweighs all the distance that the fleet can save.
 
-        Whole values keep their exact proportions if they are at most ``finest``; others are rounded up to a ``finest``-th of
-        the greatest, or less finely where the sum would grow too large.
+        Values keep their exact proportions if all are whole, or all multiples of the smallest, and at most ``finest``. Others
+        are rounded to a ``finest``-th of the greatest, or less finely where the sum would grow too large, and may then compare
+        differently: also sums of them that were equal.
 
         :param finest: Greatest prize, in multiples of the smallest that outweighs all distances
         :param largest_sum: Bound of the sum of the prizes, so that a solver's integers do not overflow
@@ -96,7 +101,12 @@ class ReducedInstance:
         """
         smallest_prize = self.n_uavs * RESOLUTION + 1
         finest = max(1, min(finest, largest_sum // (self.n_tasks * smallest_prize)))
-        whole = (self.values == np.floor(self.values)).all() and self.values.max() <= finest
-        scaled = self.values if whole else np.ceil(self.values / self.values.max() * finest)
-        counts = scaled.astype(np.int64)
+        counts = np.maximum(1, np.rint(self.values / self.values.max() * finest)).astype(np.int64)
+        for unit in (1.0, self.values.min()):
+            with np.errstate(over="ignore"):
+                multiples = self.values / unit
+            whole = np.rint(multiples)
+            if whole.max() <= finest and (np.abs(multiples - whole) <= MULTIPLE_TOLERANCE * multiples).all():
+                counts = whole.astype(np.int64)
+                break
         return counts // np.gcd.reduce(counts) * smallest_prize

@@ -8,8 +8,9 @@ import json
 import math
 import os
 import platform
+import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
@@ -283,6 +284,12 @@ def _read_schedules(path: Path) -> dict[ResultKey, str]:
     return schedules
 
 
+def _abridged(setting: Any) -> str:
+    """A setting of a solver for a message, where the beginning of a hash is enough."""
+    is_hash = isinstance(setting, str) and re.fullmatch("[0-9a-f]{64}", setting) is not None
+    return repr(setting[:8] if is_hash else setting)
+
+
 class EvaluationFolder:
     """
     ``results.csv``, ``schedules.jsonl`` and ``evaluation.json`` of one folder.
@@ -327,7 +334,7 @@ class EvaluationFolder:
         self._source_order = {source["name"]: position for position, source in enumerate(settings["instances"])}
         self._solver_order = {name: position for position, name in enumerate(settings["solvers"])}
         if resume:
-            self._read()
+            self._read({solver.name for solver in solvers if not solver.uses_time_limit})
         # In this order, so that old results never stand beside the settings of new ones.
         self._write_in_order()
         with replaced_when_complete(folder / SETTINGS_FILE) as file:
@@ -406,8 +413,8 @@ class EvaluationFolder:
             for key in sorted({*was, *is_now}):
                 if was.get(key) != is_now.get(key):
                     raise ValueError(
-                        f"{self.folder}: holds results of another {name!r}, whose {key} was {was.get(key)!r} and not "
-                        f"{is_now.get(key)!r}; give it another name, {anew}."
+                        f"{self.folder}: holds results of another {name!r}, whose {key} was {_abridged(was.get(key))} and not "
+                        f"{_abridged(is_now.get(key))}; give it another name, {anew}."
                     )
         installed = settings["runs"][0]["versions"]
         self.changed_versions = [
@@ -422,10 +429,12 @@ class EvaluationFolder:
             "runs": [*earlier["runs"], *settings["runs"]],
         }
 
-    def _read(self) -> None:
+    def _read(self, without_limit: Collection[str]) -> None:
         """
         Read what is there; results without their schedule are left out.
 
+        :param without_limit: Names of solvers that use no time limit. Their failures at one are of a time when nobody could
+            know that, and are left out: nothing would ever take their place
         :raises ValueError: If a file is damaged, or of another format
         """
         self._schedules = _read_schedules(self.folder / SCHEDULES_FILE)
@@ -435,6 +444,8 @@ class EvaluationFolder:
                     f"{self.folder / RESULTS_FILE}: holds results of {row.solver!r} on {row.source!r}, of which "
                     f"{SETTINGS_FILE} knows nothing; choose another folder, or start anew with --overwrite."
                 )
+            if row.status == FAILED and row.time_limit is not None and row.solver in without_limit:
+                continue
             if row.status == FAILED or row.key in self._schedules:
                 self.rows[row.key] = row
 

@@ -32,7 +32,7 @@ exit code:
   0    all schedules are feasible
   1    a schedule was infeasible, or a solver proved a bound that is wrong
   2    the input was wrong, and nothing was run
-  3    a solver is not installed, refused the instances or its time limit, or failed on some; the others are complete
+  3    a solver or its licence is missing, or it refused the instances or its time limit, or failed; others are complete
   130  interrupted by Ctrl-C
 """
 
@@ -99,14 +99,14 @@ def load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
 def make_solvers(args: argparse.Namespace) -> list[Solver]:
     """
     :param args: Of ``sb3-uav evaluate``
-    :return: The solvers that they ask for, the trained pair first; in place of one whose package is not installed or whose
-        time limit is 0, one that refuses all instances
+    :return: The solvers that they ask for, the trained pair first; in place of one whose package or licence is missing, or
+        whose time limit is 0, one that refuses all instances
     :raises FileNotFoundError: If a zip is missing
     :raises ValueError: If a zip is damaged, or another argument is not allowed
     """
     from sb3_uav.solvers.base import make_solver
     from sb3_uav.solvers.evaluation import UnavailableSolver
-    from sb3_uav.solvers.limits import TimeLimitError
+    from sb3_uav.solvers.limits import UnavailableError
 
     if (args.allocator is None) != (args.router is None):
         missing = "--allocator" if args.allocator is None else "--router"
@@ -122,7 +122,7 @@ def make_solvers(args: argparse.Namespace) -> list[Solver]:
     for spec in args.solvers:
         try:
             solvers.append(make_solver(spec, device=args.device, batch_size=args.batch_size))
-        except (ImportError, TimeLimitError) as error:
+        except (ImportError, UnavailableError) as error:
             solvers.append(UnavailableSolver(spec, str(error)))
     if not solvers:
         raise ValueError("There is nothing to evaluate: give --allocator with --router, or --solvers.")
