@@ -50,3 +50,17 @@ def reflect(instances: Instances, symmetry: int) -> Instances:
         offset = offset.flip(-1)
     signs = offset.new_tensor([-1.0 if symmetry & 2 else 1.0, -1.0 if symmetry & 4 else 1.0])
     return replace(instances, tasks=instances.depot[:, None] + offset * signs)
+
+
+def turn(instances: Instances, angle: th.Tensor) -> Instances:
+    """
+    Turn the tasks around the depot; all distances stay as they are, but for rounding errors.
+
+    :param instances: ``batch`` instances
+    :param angle: ``(batch,)``, in radians
+    :return: The turned instances
+    """
+    x, y = (instances.tasks - instances.depot[:, None]).unbind(-1)
+    cosine, sine = (part.to(x.dtype)[:, None] for part in (angle.cos(), angle.sin()))
+    turned = th.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
+    return replace(instances, tasks=instances.depot[:, None] + turned)

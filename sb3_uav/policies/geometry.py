@@ -21,13 +21,13 @@ FARTHEST = 1.0
 # Distances below this are as good as 0.
 NEAR = 1e-3
 # How many tasks count as the neighbourhood of a task.
-N_DENSITY, N_NEIGHBOURS, N_NEXT = 4, 8, 5
+N_DENSITY, N_NEIGHBOURS, N_NEXT = 4, 8, 16
 
 # From which part of its share of the tasks on a UAV counts as full.
 FULL = 0.95
 
 N_NODE_FEATURES = 8
-N_MOVE_FEATURES = 10
+N_MOVE_FEATURES = 15
 N_FLEET_FEATURES = 16
 
 
@@ -77,6 +77,7 @@ class MoveGeometry(NamedTuple):
     :param max_distance: ``(batch, 1)``, in the unit of the instance
     :param neighbours: ``(batch, n_tasks, n_next)`` int64, the nearest other tasks
     :param neighbour_distance: ``(batch, n_tasks, n_next)``, ``FARTHEST`` where there are fewer
+    :param neighbour_home: ``(batch, n_tasks, n_next)``, their distance to the depot
     """
 
     coordinates: th.Tensor
@@ -84,6 +85,7 @@ class MoveGeometry(NamedTuple):
     max_distance: th.Tensor
     neighbours: th.Tensor
     neighbour_distance: th.Tensor
+    neighbour_home: th.Tensor
 
     @classmethod
     def of(cls, static: StaticObservation) -> MoveGeometry:
@@ -91,7 +93,9 @@ class MoveGeometry(NamedTuple):
         coordinates = scaled_coordinates(static)
         distance = task_distances(coordinates, static.task_mask)
         near, neighbours = distance.topk(min(N_NEXT, distance.shape[1]), largest=False)
-        return cls(coordinates, th.linalg.vector_norm(coordinates, dim=-1), static.max_distance, neighbours, near)
+        home = th.linalg.vector_norm(coordinates, dim=-1)
+        neighbour_home = home[:, 1:].gather(1, neighbours.flatten(1)).view_as(near)
+        return cls(coordinates, home, static.max_distance, neighbours, near, neighbour_home)
 
     def features(self, position: th.Tensor, remaining: th.Tensor, action_mask: th.Tensor) -> th.Tensor:
         """
@@ -100,8 +104,10 @@ class MoveGeometry(NamedTuple):
         :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
         :return: ``(batch, n_samples, n_tasks + 1, N_MOVE_FEATURES)``: distance, logarithm of its ratio to that of the nearest
             feasible node, distance home from there, slack left after it, detour, remaining distance, distance home from here;
-            and whether the move leaves something behind or leads on: distance of the node to its nearest feasible neighbour,
-            logarithm of its ratio to the distance of the move, part of its neighbours that are feasible
+            whether the move leads on to others that can still be visited after it: the distance to the nearest of them,
+            logarithm of its ratio to the distance of the move, mean distance of the three nearest, parts of the 4 and the 16
+            nearest; how many tasks can be visited now, and the part of them on the side of the node, seen from the line
+            between depot and UAV; cosine of the angle between the two, seen from the depot
         """
         here = self.coordinates.gather(1, position[..., None].expand(-1, -1, 2))
         distance = euclidean(self.coordinates[:, None], here[:, :, None])
@@ -111,12 +117,27 @@ class MoveGeometry(NamedTuple):
         left = remaining[..., None]
         slack = (left - distance - home).clamp(min=-FARTHEST)
 
+        # Which neighbours of each node can still be visited after it.
         shape = (*action_mask.shape[:2], *self.neighbours.shape[1:])
         index = self.neighbours.flatten(1)[:, None].expand(-1, shape[1], -1)
         near = self.neighbour_distance[:, None]
-        is_open = action_mask[..., 1:].gather(2, index).view(shape) & (near < FARTHEST)
-        onward = functional.pad(th.where(is_open, near, FARTHEST).amin(-1), (1, 0), value=FARTHEST)
-        openness = functional.pad(is_open.sum(-1).to(distance.dtype) / shape[-1], (1, 0))
+        there = self.neighbour_home[:, None]
+        is_open = action_mask[..., 1:].gather(2, index).view(shape) & (near + there <= (left - distance)[..., 1:, None])
+        onwards = th.where(is_open, near, FARTHEST)
+        three = onwards.topk(min(3, shape[-1]), largest=False, sorted=True).values
+        onward = functional.pad(three[..., 0], (1, 0), value=FARTHEST)
+        cluster = functional.pad(three.clamp(max=0.25).mean(-1), (1, 0), value=0.25)
+        few = functional.pad(is_open[..., :4].sum(-1).to(distance.dtype) / 4, (1, 0))
+        many = functional.pad(is_open.sum(-1).to(distance.dtype) / N_NEXT, (1, 0))
+
+        feasible = action_mask.clone()
+        feasible[..., 0] = False
+        count = feasible.sum(-1, keepdim=True).to(distance.dtype)
+        x, y = self.coordinates[:, None].unbind(-1)
+        side = (here[..., :1] * y - here[..., 1:] * x).sign()
+        on_left = ((side > 0) & feasible).sum(-1, keepdim=True) / count.clamp(min=1)
+        on_side = th.where(side > 0, on_left, th.where(side < 0, 1 - on_left, 0.5))
+        angle = (here[..., :1] * x + here[..., 1:] * y) / (home * home_here).clamp(min=NEAR**2)
         fields = (
             8 * distance,
             log_ratio(distance, nearest),
@@ -127,7 +148,12 @@ class MoveGeometry(NamedTuple):
             4 * home_here,
             8 * onward.clamp(max=0.25),
             log_ratio(onward, distance),
-            openness,
+            8 * cluster,
+            few,
+            many,
+            (count + 1).log() / 3,
+            on_side,
+            angle.clamp(-1, 1),
         )
         return th.stack([field.expand_as(distance) for field in fields], dim=-1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import io
 import json
 import re
@@ -31,7 +32,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
 from sb3_uav.training.common import (
     CallbackT,
     find_run_folder,
@@ -160,6 +161,9 @@ class ITSCallback(BaseCallback):
 
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
+    :param warm_start: What gives the router a start before anything else, by its dotted path, and its arguments, as in
+        ``{"sb3_uav.solvers.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
+        the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`
     :param n_epochs: Allocator epochs (the paper's E)
     :param n_pretraining_epochs: Router epochs of pre-training (E_p)
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
@@ -190,8 +194,13 @@ class ITSCallback(BaseCallback):
         resume_from: str | None = None,
         checkpoint_freq: int = 1,
         verbose: int = 0,
+        warm_start: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         super().__init__(verbose)
+        if warm_start is not None and (not isinstance(warm_start, dict) or len(warm_start) != 1):
+            raise ValueError(
+                f"warm_start must map the dotted path of one function to its arguments, found {warm_start!r:.80}."
+            )
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy is {strategy!r}; choose one of {STRATEGIES}.")
         for name, value, least in (
@@ -218,6 +227,7 @@ class ITSCallback(BaseCallback):
         self.save_path = None if save_path is None else Path(save_path)
         self.resume_from = None if resume_from is None else Path(resume_from)
         self.checkpoint_freq = checkpoint_freq
+        self.warm_start = warm_start
 
         self.records: list[EpochRecord] = []
         self.epoch = 0
@@ -269,6 +279,8 @@ class ITSCallback(BaseCallback):
                     "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
                     f"{CHECKPOINT_FOLDER} folder of the earlier run."
                 )
+            elif self.warm_start is not None:
+                self._start_router(self.warm_start)
             self._started = True
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
         self._instances_before = self.epoch * self.instances_per_epoch
@@ -323,6 +335,24 @@ class ITSCallback(BaseCallback):
         folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
         self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
         self._freezers = {"allocator": Freezer(self.model.policy), "router": Freezer(self.router.policy)}
+
+    def _start_router(self, warm_start: dict[str, dict[str, Any]]) -> None:
+        ((path, arguments),) = warm_start.items()
+        function = resolve_path(path, "warm_start")
+        rng = random_stream(self._seed(), WARM_START_STREAM)
+
+        def report(text: str) -> None:
+            if self.verbose > 0:
+                print(text, flush=True)
+
+        positional = (self.router.policy, self.model.policy, self.problem.generator, rng)
+        try:
+            call = inspect.signature(function).bind(*positional, **{"report": report, **(arguments or {})})
+        except TypeError as error:
+            raise ValueError(f"warm_start: these arguments do not fit {path}: {error}") from error
+        with undisturbed_random_state():
+            function(*call.args, **call.kwargs)
+        self._save_checkpoint()
 
     @property
     def _router_policy(self) -> BasePolicy:
@@ -621,6 +651,20 @@ def read_state(folder: Path) -> dict[str, Any]:
     if missing:
         raise ValueError(f"{path}: fields {sorted(missing)} are missing; resume from another checkpoint.")
     return state
+
+
+def resolve_path(path: str, what: str) -> Any:
+    """
+    :param path: ``package.module.name``
+    :param what: What has this path, named in errors
+    :return: The object
+    :raises ValueError: If there is none
+    """
+    module_name, _, name = path.rpartition(".")
+    try:
+        return getattr(import_module(module_name), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{what} is {path!r}, which cannot be imported ({error}); give its dotted path.") from error
 
 
 def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
