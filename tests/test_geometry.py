@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from conftest import instance_batches
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
 from sb3_uav.policies.encoder import StaticObservation
@@ -16,6 +17,7 @@ from sb3_uav.policies.geometry import (
     FARTHEST,
     FULL,
     N_NEIGHBOURS,
+    N_NEXT,
     NEAR,
     FleetGeometry,
     MoveGeometry,
@@ -59,11 +61,42 @@ def test_features_of_a_move() -> None:
     geometry = MoveGeometry.of(static_of(instances))
     features = geometry.features(th.tensor([[1]]), th.tensor([[2.5 / 4]]), mask)[0, 0]
     slack, detour, left = 2.5 - 2.0 - 2.5, 2.0 + 2.5 - 1.5, 2.5 / 4
-    # From there the one feasible neighbour of three others (and itself) is 1.5 away.
-    ratio, onward = math.log((0.5 + NEAR) / (0.125 + NEAR)), math.log((0.375 + NEAR) / (0.5 + NEAR))
-    expected = [8 * 0.5, ratio, 2.5, slack, detour, left, 1.5, 8 * 0.25, onward, 1 / 4]
+    ratio, onward = math.log((0.5 + NEAR) / (0.125 + NEAR)), math.log((FARTHEST + NEAR) / (0.5 + NEAR))
+    # After it nothing more can be visited; both feasible tasks lie on the same side; cos 0.6 = 2.25 / (1.5 * 2.5).
+    expected = [8 * 0.5, ratio, 2.5, slack, detour, left, 1.5, 2.0, onward, 2.0, 0, 0, math.log(3) / 3, 1.0, 0.6]
     assert features[2].tolist() == pytest.approx(expected, abs=1e-5)
     assert features[4, 1] == 0
+
+
+@settings(max_examples=50)
+@given(instances=instance_batches(max_tasks=6), left=st.floats(0.05, 1.0))
+def test_what_a_move_leads_on_to(instances: Instances, left: float) -> None:
+    """From the depot, with part of the maximum flight distance, against plain Python."""
+    static = static_of(instances)
+    geometry = MoveGeometry.of(static)
+    home = geometry.home
+    mask = (2 * home <= left) & th.cat([th.zeros(len(home), 1, dtype=th.bool), static.task_mask], dim=1)
+    start = th.zeros(len(instances), 1, dtype=th.int64)
+    features = geometry.features(start, th.full((len(instances), 1), left), mask[:, None])[:, 0]
+    for row, points in enumerate(geometry.coordinates.tolist()):
+        for j in range(1, len(points)):
+            if not mask[row, j]:
+                continue
+            near = sorted(
+                (math.dist(points[j], points[k]), k) for k in range(1, len(points)) if k != j and static.task_mask[row, k - 1]
+            )
+            rest = [left - home[row, j].item() - distance - home[row, k].item() for distance, k in near]
+            is_open = [slack >= 0 and bool(mask[row, k]) for slack, (_, k) in zip(rest, near, strict=True)]
+            if any(abs(slack) < 1e-6 for slack in rest) or len({round(distance, 6) for distance, _ in near}) < len(near):
+                # Rounding decides, or which of two is the nearer one.
+                continue
+            onwards = [distance for (distance, _), free in zip(near, is_open, strict=True) if free] + 3 * [FARTHEST]
+            cluster = sum(min(distance, 0.25) for distance in onwards[:3]) / 3 if geometry.neighbours.shape[-1] >= 3 else None
+            assert features[row, j, 7].item() == pytest.approx(8 * min(onwards[0], 0.25), abs=1e-4)
+            if cluster is not None:
+                assert features[row, j, 9].item() == pytest.approx(8 * cluster, abs=1e-4)
+            assert features[row, j, 10].item() == pytest.approx(sum(is_open[:4]) / 4)
+            assert features[row, j, 11].item() == pytest.approx(sum(is_open) / N_NEXT)
 
 
 def test_features_of_a_fleet() -> None:

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, TaskAllocationEnv, UniformGenerator
-from sb3_uav.envs.sweep import N_SYMMETRIES, reflect, sweep_order
+from sb3_uav.envs.sweep import N_SYMMETRIES, reflect, sweep_order, turn
 
 
 def angles(instances: Instances, row: int) -> list[float]:
@@ -70,3 +70,14 @@ def test_environment_shows_tasks_in_sweep_order() -> None:
     assert (plain.reset(options={"instance": instances})[0]["tasks"] == observations[1]["tasks"]).all()
     with pytest.raises(ValueError, match="task_order is 'random'; choose one of"):
         TaskAllocationEnv(task_order="random")
+
+
+@given(instances=instance_batches(), angle=st.floats(-7.0, 7.0))
+def test_turning_keeps_all_distances(instances: Instances, angle: float) -> None:
+    turned = turn(instances, th.full((len(instances),), angle, dtype=th.float64))
+    for row in range(len(instances)):
+        before, after = (th.cat([x.depot[row, None], x.tasks[row]]) for x in (instances, turned))
+        th.testing.assert_close(th.cdist(after, after), th.cdist(before, before), rtol=1e-6, atol=1e-6)
+    offset = instances.tasks - instances.depot[:, None]
+    expected = offset[..., 0] * math.cos(angle) - offset[..., 1] * math.sin(angle)
+    th.testing.assert_close((turned.tasks - turned.depot[:, None])[..., 0], expected, rtol=1e-6, atol=1e-6)
