@@ -32,21 +32,23 @@ def read(folders: Sequence[Path]) -> Objectives:
     """
     :param folders: Folders of ``sb3-uav evaluate``
     :return: What the solvers found, by scenario, solver, and file and place of the instance
-    :raises ValueError: If a schedule was not feasible
+    :raises ValueError: If a solver failed, or solved an instance twice
     """
     found: dict[tuple[int, int], dict[str, dict[tuple[str, int], float]]] = defaultdict(lambda: defaultdict(dict))
     for folder in folders:
-        first: dict[str, int] = {}
         with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                if row["status"] != "ok" or row["feasible"] != "True":
-                    raise ValueError(f"{folder}: {row['solver']} failed on instance {row['instance']}: {row['message']}")
-                # Files count their instances through; a scenario has one file.
-                source, instance = row["source"], int(row["instance"])
-                first[source] = min(first.get(source, instance), instance)
-                limit = f", {float(row['time_limit']):g} s" if row["time_limit"] else ""
-                place = (source, instance - first[source])
-                found[int(row["n_uavs"]), int(row["n_tasks"])][row["solver"] + limit][place] = float(row["objective"])
+            rows = list(csv.DictReader(file))
+        # Instances are counted through all files, of which every scenario has one.
+        first = {row["source"]: min(int(r["instance"]) for r in rows if r["source"] == row["source"]) for row in rows}
+        for row in rows:
+            if row["status"] != "ok" or row["feasible"] != "True":
+                raise ValueError(f"{folder}: {row['solver']} failed on instance {row['instance']}: {row['message']}")
+            limit = f", {float(row['time_limit']):g} s" if row["time_limit"] else ""
+            place = (row["source"], int(row["instance"]) - first[row["source"]])
+            of_solver = found[int(row["n_uavs"]), int(row["n_tasks"])][row["solver"] + limit]
+            if place in of_solver:
+                raise ValueError(f"{folder}: {row['solver']} solved instance {place[1]} of {place[0]} twice; keep one result.")
+            of_solver[place] = float(row["objective"])
     return found
 
 
@@ -88,6 +90,8 @@ def main() -> None:
     print(f"| scenario | n | {args.reference} | paper | " + " | ".join(names) + " |")
     print("| :-- | --: | --: | --: | " + " | ".join(["--:"] * len(names)) + " |")
     for (n_uavs, n_tasks), solvers in sorted(found.items()):
+        if args.reference not in solvers:
+            parser.error(f"--reference {args.reference} did not solve U{n_uavs}-{n_tasks}; choose one of {sorted(solvers)}.")
         reference = solvers[args.reference]
         printed = paper_ratio(n_uavs, n_tasks)
         cells = []

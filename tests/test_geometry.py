@@ -91,10 +91,9 @@ def test_what_a_move_leads_on_to(instances: Instances, left: float) -> None:
                 # Rounding decides, or which of two is the nearer one.
                 continue
             onwards = [distance for (distance, _), free in zip(near, is_open, strict=True) if free] + 3 * [FARTHEST]
-            cluster = sum(min(distance, 0.25) for distance in onwards[:3]) / 3 if geometry.neighbours.shape[-1] >= 3 else None
+            cluster = sum(min(distance, 0.25) for distance in onwards[:3]) / 3
             assert features[row, j, 7].item() == pytest.approx(8 * min(onwards[0], 0.25), abs=1e-4)
-            if cluster is not None:
-                assert features[row, j, 9].item() == pytest.approx(8 * cluster, abs=1e-4)
+            assert features[row, j, 9].item() == pytest.approx(8 * cluster, abs=1e-4)
             assert features[row, j, 10].item() == pytest.approx(sum(is_open[:4]) / 4)
             assert features[row, j, 11].item() == pytest.approx(sum(is_open) / N_NEXT)
 
@@ -133,3 +132,18 @@ def test_neighbours_come_before_the_task_and_are_nearest(instances: Instances) -
             expected = [distance for distance in all_before[:N_NEIGHBOURS] if distance < FARTHEST - 1e-6]
             found = [distance for distance in geometry.neighbour_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
             assert found == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("n_tasks", [1, 2, 3, 5, 20])
+def test_padding_changes_nothing(n_tasks: int) -> None:
+    instances = UniformGenerator(n_tasks, 2)(4, np.random.default_rng(n_tasks))
+    few, many = static_of(instances), static_of(instances.pad(n_tasks + 9))
+    features = [node_features(scaled_coordinates(static), static.task_mask)[:, :n_tasks] for static in (few, many)]
+    th.testing.assert_close(*features)
+    moves = []
+    for static in (few, many):
+        geometry = MoveGeometry.of(static)
+        mask = th.cat([th.zeros(4, 1, dtype=th.bool), static.task_mask], dim=1) & (2 * geometry.home <= 1.0)
+        position, left = th.zeros(4, 1, dtype=th.int64), th.ones(4, 1)
+        moves.append(geometry.features(position, left, mask[:, None])[:, :, : n_tasks + 1])
+    th.testing.assert_close(*moves)

@@ -133,7 +133,7 @@ def test_shortlists_keep_the_best_and_the_first_of_equal_ones() -> None:
     tours = th.tensor([[[[0, -1]], [[1, -1]], [[1, -1]], [[2, 3]]]])
     lists.add(Block(th.tensor([[1.0, 1.0, 1.0, 2.0]]), tours))
     first = [schedule.routes for schedule in lists.schedules()[0]]
-    assert first[0] == ((2, 3),) and len(first) == 2
+    assert first == [((2, 3),), ((0,),)]
     lists.add(Block(th.tensor([[1.0, 0.5]]), th.tensor([[[[4]], [[5]]]])))
     assert [schedule.routes for schedule in lists.schedules()[0]] == first
     lists.add(Block(th.tensor([[3.0]]), th.tensor([[[[6]]]])))
@@ -145,3 +145,23 @@ def test_options_of_the_command_line(instances: Instances) -> None:
     assert make_solver("dl-drl:repair=1,polish=0.5").settings() == make_solver("dl-drl:repair=true,polish=0.5").settings()
     assert make_solver("dl-drl:repair=0").settings() == make_solver("dl-drl").settings()
     assert objectives(make_solver("dl-drl"), instances).min() > 0
+
+
+def test_shortlists_hold_different_schedules() -> None:
+    lists = Shortlists(1, 3)
+    copies = th.zeros(1, 9, 1, 1, dtype=th.int64)
+    lists.add(Block(th.full((1, 10), 2.0), th.cat([copies, copies[:, :1] + 1], dim=1)))
+    assert [schedule.routes for schedule in lists.schedules()[0]] == [((0,),), ((1,),)]
+
+
+def test_every_instance_has_its_share_of_the_time(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    given_seconds: list[float] = []
+
+    def noting(instance: Instances, candidates: Any, seconds: float) -> Schedule:
+        given_seconds.append(seconds)
+        return candidates[0]
+
+    monkeypatch.setattr("sb3_uav.solvers.local_search.repair_best", noting)
+    refinement = Refinement(repair=True)
+    refinement(instances, [[Schedule([])]] * len(instances), time.perf_counter() + 8.0)
+    assert len(given_seconds) == 4 and all(1.5 < seconds <= 2.0 for seconds in given_seconds)

@@ -64,3 +64,22 @@ def test_errors_name_what_is_wrong() -> None:
     model = REINFORCE("RouterPolicy", BatchedVecEnv([lambda: RoutePlanningEnv(5)] * 2), policy_kwargs=SMALL, device="cpu")
     with pytest.raises(ValueError, match="needs an AllocatorPolicy on a TaskAllocation environment"):
         model.learn_instances(4, SizeGridCallback(SIZES))
+
+
+def test_a_resumed_run_keeps_the_best_pair_and_the_history(tmp_path: Path) -> None:
+    """Also when it goes on in a folder of its own, as the zoo's do."""
+    fixed, _ = train(tmp_path / "first")
+    best = {name: (tmp_path / "first" / name).read_bytes() for name in ("best_allocator.zip", "best_router.zip")}
+    checkpoint = tmp_path / "first" / "its_checkpoint"
+    env = BatchedVecEnv([lambda: TaskAllocationEnv(8, 2)] * 4)
+    model: Any = REINFORCE.load(checkpoint / "allocator_3.zip", env=env, device="cpu")
+    router = dict(policy="RouterPolicy", n_envs=4, learning_rate=1e-2, policy_kwargs=SMALL)
+    its = ITSCallback(
+        router, n_epochs=4, n_pretraining_epochs=1, save_path=str(tmp_path / "second"), resume_from=str(checkpoint)
+    )
+    again = SizeGridCallback(SIZES, max_distance=1.5, freq=1)
+    # Nothing that comes is as good as what has been.
+    again.evaluate = lambda: -1.0  # type: ignore[method-assign]
+    model.learn(10**9, callback=[its, again], reset_num_timesteps=False)
+    assert again.records == fixed.records and again.best_score == pytest.approx(fixed.best_score)
+    assert best == {name: (tmp_path / "second" / name).read_bytes() for name in best}

@@ -172,8 +172,17 @@ class AllocationProblem(Problem):
         super().__init__(generator)
         self.router: Router = router or nearest_feasible
         self.task_order = task_order
+
+    @property
+    def task_order(self) -> str:
+        """In which order the tasks are shown."""
+        return self._task_order
+
+    @task_order.setter
+    def task_order(self, task_order: str) -> None:
         if task_order not in TASK_ORDERS:
             raise ValueError(f"task_order is {task_order!r}; choose one of {TASK_ORDERS}.")
+        self._task_order = task_order
 
     def arrange(self, instances: Instances) -> Instances:
         return instances.reorder(sweep_order(instances)) if self.task_order == "sweep" else instances
@@ -229,7 +238,7 @@ class TaskAllocationEnv(ProblemEnv):
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
     :param router: Plans the tours of the reward; nearest feasible task when None

@@ -499,10 +499,11 @@ class MixtureGenerator:
         :return: Instances of a random size
         """
         n_uavs = int(rng.integers(min(2, self.n_uavs), self.n_uavs, endpoint=True))
-        fewest = min(max(self.min_tasks, TASKS_PER_UAV * n_uavs), self.n_tasks)
+        least = min(self.min_tasks, self.n_tasks)
+        fewest = min(max(least, TASKS_PER_UAV * n_uavs), self.n_tasks)
         n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** SMALL_SIZES))
         factor = 1.0 if rng.random() < 0.5 else rng.uniform(0.6, 1.6)
-        n_instances = max(round(batch_size * (self.min_tasks / n_tasks) ** FEWER_INSTANCES), 2)
+        n_instances = max(round(batch_size * (least / n_tasks) ** FEWER_INSTANCES), 2)
         return UniformGenerator(n_tasks, n_uavs, self.max_distance * factor)(n_instances, rng)
 
 
@@ -555,7 +556,7 @@ def make_generator(
     :param n_tasks: Number of tasks; ignored when ``instances`` is given
     :param n_uavs: Number of UAVs; ignored when ``instances`` is given
     :param max_distance: Maximum flight distance; ignored when ``instances`` is given
-    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Instances, or the path of an ``.npz`` file, to draw from instead of a distribution
     :raises ValueError: If an argument is not allowed
     """

@@ -53,6 +53,16 @@ def task_distances(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     return distance.diagonal_scatter(distance.new_full(task_mask.shape, FARTHEST), dim1=1, dim2=2)
 
 
+def smallest(distance: th.Tensor, n_smallest: int) -> th.Tensor:
+    """
+    :param distance: ``(..., n)``
+    :param n_smallest: How many to find
+    :return: ``(..., n_smallest)``, the smallest, ``FARTHEST`` where there are fewer, because padding must not change anything
+    """
+    found = distance.topk(min(n_smallest, distance.shape[-1]), largest=False).values
+    return functional.pad(found, (0, n_smallest - found.shape[-1]), value=FARTHEST)
+
+
 def node_features(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     """
     What the encoder is told of every task: its place, and how dense the tasks are around it.
@@ -63,7 +73,7 @@ def node_features(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     """
     tasks = coordinates[:, 1:]
     home = th.linalg.vector_norm(tasks, dim=-1, keepdim=True)
-    nearest = task_distances(coordinates, task_mask).topk(min(N_DENSITY, tasks.shape[1]), largest=False).values
+    nearest = smallest(task_distances(coordinates, task_mask), N_DENSITY)
     density = th.stack([nearest[..., 0], nearest.mean(-1)], dim=-1).clamp(min=NEAR).log() + 3.0
     return th.cat([4 * tasks, 4 * home, 8 * home**2, tasks / home.clamp(min=NEAR), density], dim=-1)
 
@@ -74,7 +84,6 @@ class MoveGeometry(NamedTuple):
 
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param home: ``(batch, n_tasks + 1)``, distance to the depot
-    :param max_distance: ``(batch, 1)``, in the unit of the instance
     :param neighbours: ``(batch, n_tasks, n_next)`` int64, the nearest other tasks
     :param neighbour_distance: ``(batch, n_tasks, n_next)``, ``FARTHEST`` where there are fewer
     :param neighbour_home: ``(batch, n_tasks, n_next)``, their distance to the depot
@@ -82,7 +91,6 @@ class MoveGeometry(NamedTuple):
 
     coordinates: th.Tensor
     home: th.Tensor
-    max_distance: th.Tensor
     neighbours: th.Tensor
     neighbour_distance: th.Tensor
     neighbour_home: th.Tensor
@@ -95,7 +103,7 @@ class MoveGeometry(NamedTuple):
         near, neighbours = distance.topk(min(N_NEXT, distance.shape[1]), largest=False)
         home = th.linalg.vector_norm(coordinates, dim=-1)
         neighbour_home = home[:, 1:].gather(1, neighbours.flatten(1)).view_as(near)
-        return cls(coordinates, home, static.max_distance, neighbours, near, neighbour_home)
+        return cls(coordinates, home, neighbours, near, neighbour_home)
 
     def features(self, position: th.Tensor, remaining: th.Tensor, action_mask: th.Tensor) -> th.Tensor:
         """
@@ -123,8 +131,7 @@ class MoveGeometry(NamedTuple):
         near = self.neighbour_distance[:, None]
         there = self.neighbour_home[:, None]
         is_open = action_mask[..., 1:].gather(2, index).view(shape) & (near + there <= (left - distance)[..., 1:, None])
-        onwards = th.where(is_open, near, FARTHEST)
-        three = onwards.topk(min(3, shape[-1]), largest=False, sorted=True).values
+        three = smallest(th.where(is_open, near, FARTHEST), 3)
         onward = functional.pad(three[..., 0], (1, 0), value=FARTHEST)
         cluster = functional.pad(three.clamp(max=0.25).mean(-1), (1, 0), value=0.25)
         few = functional.pad(is_open[..., :4].sum(-1).to(distance.dtype) / 4, (1, 0))
@@ -332,7 +339,7 @@ class FleetGeometry(NamedTuple):
             4 * home,
             task[..., None] / self.n_real[..., None],
             (self.n_real[..., None] / n_uavs).log() - 3.0,
-            self.n_real.new_tensor(1.0 / n_uavs),
+            self.n_real.new_full((), 1.0 / n_uavs),
             empty.mean(-1, keepdim=True),
         )
         return th.stack([field.expand_as(load) for field in fields], dim=-1)

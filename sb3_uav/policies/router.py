@@ -123,14 +123,17 @@ class RouterExtractor(EpisodicExtractor):
         self.project_step = nn.Linear(embed_dim + 1, embed_dim, bias=False)
         self.project_nodes = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_glimpse = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.scaled = relative or geometry
         self.move_bias = MoveBias(embed_dim, n_heads + 1) if geometry else None
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
         real = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)[..., None]
         graph = nodes.masked_fill(~real, 0.0).sum(1) / real.sum(1)
         glimpse_key, glimpse_value, logit_key = self.project_nodes(nodes).chunk(3, dim=-1)
+        # What the remaining distance is measured in.
+        unit = static.max_distance if self.scaled else th.ones_like(static.max_distance)
         geometry = () if self.move_bias is None else (self.move_bias.project_node(nodes), *MoveGeometry.of(static))
-        return Cache(nodes, (self.project_graph(graph)[:, None], glimpse_key, glimpse_value, logit_key, *geometry))
+        return Cache(nodes, (self.project_graph(graph)[:, None], glimpse_key, glimpse_value, logit_key, unit, *geometry))
 
     def observed_state(self, cache: Cache, observation: TensorDict) -> RouterState:
         return RouterState(
@@ -140,13 +143,11 @@ class RouterExtractor(EpisodicExtractor):
         )
 
     def decode(self, cache: Cache, state: RouterState) -> th.Tensor:
-        graph, glimpse_key, glimpse_value, logit_key, *rest = cache.projections
+        graph, glimpse_key, glimpse_value, logit_key, unit, *rest = cache.projections
         here = cache.nodes.gather(1, state.position[..., None].expand(-1, -1, self.embed_dim))
-        remaining = state.remaining_distance
+        remaining = state.remaining_distance / unit
         glimpse_bias = th.zeros_like(state.action_mask, dtype=here.dtype)[:, None]
         logit_bias = glimpse_bias[:, 0]
-        if self.move_bias is not None:
-            remaining = remaining / MoveGeometry(*rest[1:]).max_distance
         query = graph + self.project_step(th.cat([here, remaining[..., None]], dim=-1))
         if self.move_bias is not None:
             features = MoveGeometry(*rest[1:]).features(state.position, remaining, state.action_mask)

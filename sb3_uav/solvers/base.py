@@ -154,7 +154,7 @@ class OneByOneSolver(Solver):
 SOLVERS: dict[str, str] = {
     "dl-drl": "sb3_uav.solvers.dl_drl:load_dl_drl",
     # The paper's name for pairs whose router was not trained with the allocator.
-    "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl",
+    "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl_i",
     "kmeans-am": "sb3_uav.solvers.kmeans_am:load_kmeans_am",
     "greedy-insertion": "sb3_uav.solvers.insertion:GreedyInsertion",
     "milp": "sb3_uav.solvers.milp:MILP",

@@ -275,11 +275,15 @@ class Shortlists:
 
     def add(self, block: Block) -> None:
         """:param block: More schedules of the same instances"""
-        value, index = block.value.topk(min(self.length, block.value.shape[1]), dim=1)
-        rows = th.arange(len(index), device=index.device)[:, None]
-        for found, values, tours in zip(self._found, value.tolist(), block.tours[rows, index], strict=True):
-            new = dict(zip(schedules(tours), values, strict=True))
-            # The sort is stable: of equal ones, those that were there before stay.
+        values, order = block.value.sort(dim=1, descending=True, stable=True)
+        for found, tours, value, places in zip(self._found, block.tours, values.tolist(), order, strict=True):
+            worst = min(found.values()) if len(found) >= self.length else -math.inf
+            new: dict[Schedule, float] = {}
+            for place, objective in zip(places, value, strict=True):
+                if objective <= worst or len(new) == self.length:
+                    break
+                new.setdefault(schedules(tours[place, None])[0], objective)
+            # This sort is stable too: of equal ones, those that were there before stay.
             best = sorted((found | new).items(), key=lambda item: -item[1])
             found.clear()
             found.update(best[: self.length])
@@ -338,3 +342,19 @@ def load_dl_drl(
     solver = DLDRL(*networks, decode, samples, batch_size, None, repair, polish, time_limit)
     solver.files = dict(zip(("allocator", "router"), files, strict=True))
     return solver
+
+
+def load_dl_drl_i(
+    allocator: str,
+    router: str,
+    decode: str = "greedy",
+    samples: int = 128,
+    device: str = "auto",
+    batch_size: int | None = None,
+) -> DLDRL:
+    """
+    DL-DRL-I, whose router was not trained with the allocator: no such pair comes with the package.
+
+    The parameters are those of :func:`load_dl_drl`.
+    """
+    return load_dl_drl(allocator, router, decode, samples, device, batch_size)

@@ -76,7 +76,7 @@ def imitate(
         raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
     lessons = search_lessons(allocator, generator, rng, n_subsets, batch_size, report)
     optimizer = th.optim.Adam(router.parameters(), learning_rate)
-    start, total, n_moves = time.perf_counter(), 0.0, 0
+    start, total, n_moves = time.perf_counter(), th.zeros((), device=router.device), 0
     router.set_training_mode(True)
     for update in range(1, n_updates + 1):
         cosine = 0.5 * (1 + math.cos(math.pi * update / n_updates))
@@ -85,17 +85,18 @@ def imitate(
         lesson = varied(lessons[int(rng.integers(len(lessons)))], rng, batch_size)
         lesson = Lesson(lesson.instances.to(router.device), lesson.tours.to(router.device))
         is_move = lesson.tours > 0
+        n_new = int((lesson.tours > 0).sum())
         log_prob = router.evaluate_episodes(lesson.instances, lesson.tours[:, None]).log_prob[:, 0]
-        loss = -log_prob[is_move].sum() / is_move.sum().clamp(min=1)
+        loss = -log_prob[is_move].sum() / max(n_new, 1)
         optimizer.zero_grad()
         loss.backward()
         th.nn.utils.clip_grad_norm_(router.parameters(), MAX_GRAD_NORM)
         optimizer.step()
-        total, n_moves = total + loss.item() * int(is_move.sum()), n_moves + int(is_move.sum())
+        total, n_moves = total + n_new * loss.detach(), n_moves + n_new
         if update % REPORT_EVERY == 0 or update == n_updates:
-            seconds = time.perf_counter() - start
-            report(f"imitation: {update} of {n_updates} updates, {total / max(n_moves, 1):.3f} nats a move, {seconds:.0f} s")
-            total, n_moves = 0.0, 0
+            seconds, nats = time.perf_counter() - start, total.item() / max(n_moves, 1)
+            report(f"imitation: {update} of {n_updates} updates, {nats:.3f} nats a move, {seconds:.0f} s")
+            total, n_moves = th.zeros_like(total), 0
     router.set_training_mode(False)
 
 

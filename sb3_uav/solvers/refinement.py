@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch as th
@@ -78,25 +78,22 @@ class Refinement:
         """
         if not self.is_wanted:
             return [found[0] for found in candidates]
+        from sb3_uav.solvers.local_search import repair_best
+
         n_threads = min(th.get_num_threads(), len(instances))
+        # Of the time that is left, every instance gets an equal share, and the polishing, if there is any, three quarters.
+        n_rounds = math.ceil(len(instances) / n_threads)
+        left = (deadline - time.perf_counter()) / n_rounds
+        repairing = left * (REPAIR_SHARE if self.polish > 0 else 1.0)
         with ThreadPoolExecutor(n_threads) as pool:
-            best = list(pool.map(lambda i: self._repaired(instances[i], candidates[i], deadline), range(len(instances))))
-            if self.polish == 0:
-                return best
-            n_rounds = math.ceil(len(instances) / n_threads)
+            best = [found[0] for found in candidates]
+            if self.repair:
+                seconds = None if math.isinf(repairing) else max(repairing, LEAST_REPAIR_SECONDS)
+                best = list(pool.map(lambda i: repair_best(instances[i], candidates[i], seconds), range(len(instances))))
             seconds = min(self.polish, (deadline - time.perf_counter()) / n_rounds)
             if seconds <= 0:
                 return best
             return list(pool.map(lambda i: polish(instances[i], best[i], seconds, seed), range(len(instances))))
-
-    def _repaired(self, instance: Instances, candidates: Iterable[Schedule], deadline: float) -> Schedule:
-        from sb3_uav.solvers.local_search import repair_best
-
-        candidates = list(candidates)
-        if not self.repair:
-            return candidates[0]
-        seconds = deadline - time.perf_counter()
-        return repair_best(instance, candidates, None if math.isinf(seconds) else max(seconds, LEAST_REPAIR_SECONDS))
 
 
 def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 0) -> Schedule:

@@ -18,12 +18,13 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
 from sb3_uav.training.common import siblings, write_atomically
-from sb3_uav.training.its import ITSCallback
+from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
 
 # UAVs, tasks, instances.
 DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
 # Far from every stream of the training.
 GRID_SEED = 30_000_001
+GRID_FILE, BEST_ALLOCATOR_FILE = "size_grid.csv", "best_allocator.zip"
 
 
 class SizeGridCallback(BaseCallback):
@@ -61,6 +62,7 @@ class SizeGridCallback(BaseCallback):
         }
         self.records: list[dict[str, float]] = []
         self.best_score = -np.inf
+        self._is_restored = False
 
     def _on_training_start(self) -> None:
         problem = find_problem(self.training_env)
@@ -74,6 +76,8 @@ class SizeGridCallback(BaseCallback):
         return found[0] if found else None
 
     def _on_rollout_start(self) -> None:
+        if not self._is_restored:
+            self._restore()
         if self.model._n_updates % self.freq == 0 and (
             not self.records or self.records[-1]["updates"] != self.model._n_updates
         ):
@@ -81,6 +85,29 @@ class SizeGridCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+    def _folder(self) -> Path | None:
+        its = self._its()
+        return self.save_path or (None if its is None else its.save_path)
+
+    def _restore(self) -> None:
+        """Go on with the history, and with the best pair, of a run that is resumed."""
+        self._is_restored = True
+        folder, its = self._folder(), self._its()
+        if folder is None or self.model._n_updates == 0:
+            return
+        earlier = [folder] if its is None or its.resume_from is None else [folder, its.resume_from.parent]
+        for source in earlier:
+            if not (source / GRID_FILE).is_file():
+                continue
+            with (source / GRID_FILE).open(newline="", encoding="utf-8") as file:
+                rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+            self.records = [row for row in rows if row["updates"] <= self.model._n_updates]
+            self.best_score = max((row["score"] for row in rows), default=-np.inf)
+            for name in (BEST_ALLOCATOR_FILE, BEST_ROUTER_FILE):
+                if source != folder and (source / name).is_file():
+                    write_atomically(folder / name, (source / name).read_bytes())
+            return
 
     def evaluate(self) -> float:
         """
@@ -102,17 +129,17 @@ class SizeGridCallback(BaseCallback):
         if self.verbose > 0:
             found = ", ".join(f"{name} {objective:.2f}" for name, objective in objectives.items())
             print(f"update {self.model._n_updates}: {found}, score {score:.4f}", flush=True)
-        folder = self.save_path or (None if its is None else its.save_path)
+        folder = self._folder()
         if folder is not None:
             text = io.StringIO()
             writer = csv.DictWriter(text, list(self.records[0]))
             writer.writeheader()
             writer.writerows(self.records)
-            write_atomically(folder / "size_grid.csv", text.getvalue())
+            write_atomically(folder / GRID_FILE, text.getvalue())
             if score > self.best_score:
-                save_atomically(self.model, folder / "best_allocator.zip")
+                save_atomically(self.model, folder / BEST_ALLOCATOR_FILE)
                 if its is not None:
-                    save_atomically(its.router, folder / "best_router.zip")
+                    save_atomically(its.router, folder / BEST_ROUTER_FILE)
         self.best_score = max(self.best_score, score)
         return score
 

@@ -96,16 +96,20 @@ class AllocatedSubsets:
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
         Where the generator mixes sizes, subsets of one batch chosen at random, so that small subsets are not padded to large
-        ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets.
+        ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets. As every update draws its batch
+        anew, :attr:`fraction` does not apply to them.
         """
         if not isinstance(self.generator, MixtureGenerator):
             return self(batch_size, rng)
+        start = time.perf_counter()
         own_rng = self.stream(self._n_chunks)
         self._n_chunks += 1
         subsets = self._allocate(self.draw_batch(self.batches[int(own_rng.integers(len(self.batches)))]), own_rng)
         n_rows = max(round(batch_size * self.generator.min_tasks / subsets.n_tasks), 2)
         drawn = subsets[own_rng.permutation(len(subsets))[:n_rows]]
-        return drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+        drawn = drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+        self.seconds += time.perf_counter() - start
+        return drawn
 
     def _next_chunk(self) -> Instances:
         rng = self.stream(self._n_chunks)
