@@ -130,7 +130,8 @@ class MoveGeometry(NamedTuple):
         index = self.neighbours.flatten(1)[:, None].expand(-1, shape[1], -1)
         near = self.neighbour_distance[:, None]
         there = self.neighbour_home[:, None]
-        is_open = action_mask[..., 1:].gather(2, index).view(shape) & (near + there <= (left - distance)[..., 1:, None])
+        is_near = (near < FARTHEST) & (near + there <= (left - distance)[..., 1:, None])
+        is_open = is_near & action_mask[..., 1:].gather(2, index).view(shape)
         three = smallest(th.where(is_open, near, FARTHEST), 3)
         onward = functional.pad(three[..., 0], (1, 0), value=FARTHEST)
         cluster = functional.pad(three.clamp(max=0.25).mean(-1), (1, 0), value=0.25)
