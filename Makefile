@@ -7,7 +7,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 LINT_PATHS := sb3_uav tests benchmarks examples
-BENCHMARKS := $(filter-out benchmarks/_%,$(sort $(wildcard benchmarks/*.py)))
+# Some are about results, not speed: they take arguments and an hour.
+BENCHMARKS := $(filter-out benchmarks/_% benchmarks/ablation.py benchmarks/better_than_the_paper.py,$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

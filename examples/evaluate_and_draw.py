@@ -26,7 +26,7 @@ args = parser.parse_args()
 # Zips are read without unpickling anything, so those of other people are safe.
 allocator = load_policy(args.allocator, expected=AllocatorPolicy)
 router = load_policy(args.router, expected=RouterPolicy)
-instances = UniformGenerator(20, allocator.n_uavs, max_distance=1.5)(args.n_instances, np.random.default_rng(7))
+instances = UniformGenerator(20, n_uavs=3, max_distance=1.5)(args.n_instances, np.random.default_rng(7))
 
 solvers: list[Solver] = [
     DLDRL(allocator, router),

@@ -1,5 +1,7 @@
 """Environment ids. Importing this module needs gymnasium alone; the environments are imported when they are made."""
 
+from typing import Any
+
 import gymnasium as gym
 
 PAPER_FLEETS = (4, 6)
@@ -7,6 +9,8 @@ PAPER_SIZES = (80, 100, 150, 200, 300, 500)
 GENERALISATION_SIZES = (600, 700, 800, 900, 1000, 1500)
 # With the paper's D = 2.0, nearly all of so few tasks could be visited, and there would be little to learn.
 DEMO_FLEET, DEMO_SIZE, DEMO_MAX_DISTANCE = 3, 20, 1.5
+# Training batches of mixed sizes, for one pair of networks that serves them all.
+UNIVERSAL_ID, UNIVERSAL_FLEET, UNIVERSAL_SIZE = "TaskAllocation-Universal-v0", 8, 500
 
 
 def allocation_id(n_uavs: int, n_tasks: int) -> str:
@@ -18,7 +22,7 @@ def routing_id(n_tasks: int) -> str:
 
 
 def register_envs() -> None:
-    """Register every scenario of the paper (D = 2.0) and the small one of the demo; registering twice changes nothing."""
+    """Register the scenarios of the paper (D = 2.0), of the demo and the mixture; registering twice changes nothing."""
     sizes = (*PAPER_SIZES, *GENERALISATION_SIZES)
     for n_uavs in PAPER_FLEETS:
         for n_tasks in sizes:
@@ -28,9 +32,11 @@ def register_envs() -> None:
     demo = {"max_distance": DEMO_MAX_DISTANCE}
     _register(allocation_id(DEMO_FLEET, DEMO_SIZE), "allocation:TaskAllocationEnv", DEMO_SIZE, n_uavs=DEMO_FLEET, **demo)
     _register(routing_id(DEMO_SIZE), "routing:RoutePlanningEnv", DEMO_SIZE, **demo)
+    universal = dict(n_uavs=UNIVERSAL_FLEET, distribution="mixture")
+    _register(UNIVERSAL_ID, "allocation:TaskAllocationEnv", UNIVERSAL_SIZE, **universal)
 
 
-def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: float) -> None:
+def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: Any) -> None:
     if env_id not in gym.registry:
         gym.register(
             id=env_id,

@@ -381,7 +381,8 @@ def test_the_router_learns(algorithm):
         n_epochs=4,
         gamma=1.0,
         rollout_buffer_class=BUFFERS[algorithm],
-        policy_kwargs=dict(embed_dim=32, n_layers=2, n_heads=4, ff_dim=64),
+        # With geometry it would begin with good tours.
+        policy_kwargs=dict(embed_dim=32, n_layers=2, n_heads=4, ff_dim=64, geometry=False),
         seed=0,
         device="cpu",
     )

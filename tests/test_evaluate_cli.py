@@ -39,7 +39,7 @@ class Inputs:
         env = make_vec_env("TaskAllocation-U3-N20-v0", 4, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
         # Two algorithms, because a zip may come from any.
         policy: Any = AllocatorPolicy
-        PPO(policy, env, n_steps=16, policy_kwargs=dict(TINY), seed=0, device="cpu").save(self.allocator)
+        PPO(policy, env, n_steps=16, policy_kwargs=dict(TINY, shared_scorer=False), seed=0, device="cpu").save(self.allocator)
         env = make_vec_env("RoutePlanning-N20-v0", 4, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
         REINFORCE(RouterPolicy, env, policy_kwargs=dict(TINY), seed=0, device="cpu").save(self.router)
         UniformGenerator(20, n_uavs=3)(4, np.random.default_rng(0)).save(self.small)
@@ -448,7 +448,7 @@ def test_wrong_arguments(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureF
         ((*solver, "--jobs", 0), "The number of jobs is 0; give at least 1."),
         ((*solver, "--time-limit", 1, -1), "A time limit is -1.0; it must be a number of seconds, at least 0."),
         ((*solver, "--reference", "magic"), "The reference 'magic' is none of the solvers ['kmeans-nearest']."),
-        ((*common, "--solvers", "dl-drl"), "Solver 'dl-drl' needs the option allocator=<str>"),
+        ((*common, "--solvers", "kmeans-am"), "Solver 'kmeans-am' needs the option router=<str>"),
         ((*common, *inputs.pair, "--decode", "sampling", "--samples", 0), "samples is 0; give at least 1."),
         ((*common, *inputs.pair, "--batch-size", 0), "batch_size is 0; give at least 1."),
         ((*common, *inputs.pair, "--device", "abacus"), "device is 'abacus', which cannot be used"),

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothi
 
 
 def allocation_env() -> TaskAllocationEnv:
-    return TaskAllocationEnv(N_TASKS, N_UAVS, max_distance=1.5)
+    return TaskAllocationEnv(N_TASKS, N_UAVS, max_distance=1.5, task_order="sweep")
 
 
 def routing_env() -> RoutePlanningEnv:
@@ -519,7 +519,8 @@ def test_bad_uses_are_named(tmp_path):
         FixedSetEvalCallback(instances=str(tmp_path / "none.npz"))
     other_fleet = UniformGenerator(N_TASKS, n_uavs=3)(2, np.random.default_rng(0))
     with pytest.raises(ValueError, match="trained for 2 UAVs, the instances have 3"):
-        make_model(PPO).learn(ROLLOUT, callback=make_callback(tmp_path, instances=other_fleet))
+        model = make_model(PPO, policy_kwargs=dict(NETWORK, shared_scorer=False))
+        model.learn(ROLLOUT, callback=make_callback(tmp_path, instances=other_fleet))
     with pytest.raises(ValueError, match="needs an AllocatorPolicy or RouterPolicy on an environment of sb3_uav, found"):
         PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).learn(8, callback=make_callback(tmp_path))
 

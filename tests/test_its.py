@@ -11,7 +11,16 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 
-from sb3_uav.envs import BatchedVecEnv, Instances, TaskAllocationEnv, UniformGenerator, check_schedule, plan_tours, schedules
+from sb3_uav.envs import (
+    BatchedVecEnv,
+    Instances,
+    MixtureGenerator,
+    TaskAllocationEnv,
+    UniformGenerator,
+    check_schedule,
+    plan_tours,
+    schedules,
+)
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import Freezer, ITSCallback
@@ -160,14 +169,14 @@ def test_freezer_restores_only_what_learned_before():
     freezer.freeze()
     assert not policy.training and not any(p.requires_grad for p in policy.parameters())
     freezer.thaw()
-    assert policy.action_net.weight.requires_grad and not policy.value_net.weight.requires_grad
+    assert policy.features_extractor.scorer.score.weight.requires_grad and not policy.value_net.weight.requires_grad
 
 
 # ------------------------------------------------------------------------------------------ the router's data
 
 
-def make_subsets(fraction: float, n_batches: int = 3) -> tuple[AllocatedSubsets, Any]:
-    model = make_allocator()
+def make_subsets(fraction: float, n_batches: int = 3, **kwargs) -> tuple[AllocatedSubsets, Any]:
+    model = make_allocator(**kwargs)
     subsets = AllocatedSubsets(
         model.policy,
         model.problem.generator,
@@ -210,7 +219,7 @@ def test_alternate_data_are_a_random_part():
 
 
 def test_subsets_follow_the_current_allocator():
-    subsets, model = make_subsets(1.0)
+    subsets, model = make_subsets(1.0, policy_kwargs=dict(SMALL, shared_scorer=False))
     model.policy.action_net.bias.data = th.tensor([50.0, -50.0])
     sizes = subsets(8, np.random.default_rng(0)).task_mask.sum(1)
     assert set(sizes.tolist()) <= {0, N_TASKS} and N_TASKS in sizes
@@ -230,6 +239,43 @@ def test_pretraining_instances_are_whole():
     assert th.equal(drawn.tasks, UniformGenerator(6, 4, 1.5)(3, np.random.default_rng(0)).tasks)
 
 
+def make_mixture() -> tuple[AllocatedSubsets, Any]:
+    env = BatchedVecEnv([lambda: TaskAllocationEnv(60, 3, distribution="mixture")] * 8)
+    model: Any = REINFORCE(AllocatorPolicy, env, seed=0, device="cpu", policy_kwargs=SMALL, instances_per_epoch=8)
+    generator = MixtureGenerator(60, 3, min_tasks=24)
+    env.set_generator(generator)
+    stream = np.random.default_rng
+    return AllocatedSubsets(model.policy, generator, model.draw_batch, range(5), 1.0, lambda chunk: stream(chunk)), model
+
+
+def test_mixed_subsets_come_from_one_batch_each():
+    """So that small ones are not padded to large ones; of small ones there are more."""
+    subsets, model = make_mixture()
+    batches = [model.draw_batch(i) for i in range(5)]
+    assert len({(batch.n_tasks, batch.n_uavs) for batch in batches}) > 1
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        drawn = subsets.training_batch(6, rng)
+        owners = [i for i, batch in enumerate(batches) if points(drawn) <= points(batch)]
+        assert len(owners) == 1 and drawn.n_uavs == 1
+        assert 2 <= len(drawn) <= 6 * 24 and drawn.task_mask.any(0).all()
+
+
+def test_router_epochs_may_have_their_own_size():
+    its = make_its(n_epochs=2, n_pretraining_epochs=1, router_instances_per_epoch=12)
+    learn(make_allocator(), its)
+    sizes = {(record.level, record.n_instances) for record in its.records}
+    assert sizes == {("allocator", 8), ("router", 12)}
+
+
+def test_updates_of_a_mixture_have_one_size_each():
+    """An epoch is over after its number of instances, not of batches."""
+    _, model = make_mixture()
+    model.learn_instances(20)
+    batches = [len(model.draw_batch(i)) for i in range(model.n_batches)]
+    assert model.n_instances == sum(batches) >= 20 > sum(batches[:-1]) and len(set(batches)) > 1
+
+
 # ------------------------------------------------------------------------------------------ router, zips, resuming
 
 
@@ -242,7 +288,7 @@ def test_router_reaches_training_and_evaluation_env():
     actions = model.policy.decode_episodes(instances)
     expected = plan_tours(instances, actions, its.router.policy.plan).value
     for vec_env in (model.env, env):
-        assert vec_env.problem.router == its.router.policy.plan
+        assert vec_env.problem.router == its.router.policy.plan and vec_env.problem.task_order == "sweep"
         assert th.equal(vec_env.problem.returns(instances, actions), expected)
 
 

@@ -510,6 +510,11 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         ff_dim=20,
         normalization="layer",
         use_values=True,
+        relative=True,
+        geometry=True,
+        shared_scorer=False,
+        sweep=True,
+        mixed_precision=True,
         net_arch=dict(pi=[], vf=[8]),
         activation_fn=nn.ReLU,
         ortho_init=True,
@@ -581,7 +586,14 @@ def test_networks_take_any_number_of_tasks():
 
 def test_wrong_fleet_is_refused():
     with pytest.raises(ValueError, match="trained for 3 UAVs, the instances have 5"):
-        make_policy("allocator").decode_episodes(draw(2, n_uavs=5))
+        make_policy("allocator", preset="paper").decode_episodes(draw(2, n_uavs=5))
+
+
+@pytest.mark.parametrize("n_uavs", [1, 2, 9])
+def test_shared_scorer_serves_any_fleet(n_uavs):
+    """Made for 3 UAVs: every UAV of another fleet gets tasks."""
+    actions = make_policy("allocator", n_uavs=3).decode_episodes(draw(4, n_tasks=40, n_uavs=n_uavs))
+    assert [sorted(set(row)) for row in actions[:, 0].tolist()] == [list(range(n_uavs))] * 4
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sb3_uav.envs import Instances
+from sb3_uav.envs import Instances, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 
@@ -31,7 +31,7 @@ def test_example_of_the_first_screen(tmp_path, monkeypatch):
 
 
 def test_example_of_ppo():
-    example = EXAMPLES[1]
+    example = EXAMPLES[2]
     for full, small in (("n_envs=64", "n_envs=4"), ("learn(300_000)", "learn(320)")):
         assert full in example
         example = example.replace(full, small)
@@ -40,10 +40,15 @@ def test_example_of_ppo():
     assert type(variables["model"].policy) is RouterPolicy and variables["model"].num_timesteps >= 320
 
 
-def test_example_of_own_instances(tmp_path, monkeypatch):
+def test_example_of_a_schedule_now(tmp_path, monkeypatch):
+    pytest.importorskip("numba")
     monkeypatch.chdir(tmp_path)
-    exec(EXAMPLES[2], {})
-    assert Instances.load(tmp_path / "my_instances.npz").n_uavs == 4
+    variables: dict[str, Any] = {}
+    exec(EXAMPLES[1].replace("rand(16, ", "rand(2, "), variables)
+    instances = Instances.load(tmp_path / "my_instances.npz")
+    assert instances.n_uavs == 4 and len(variables["schedules"]) == 2
+    for row, schedule in enumerate(variables["schedules"]):
+        assert check_schedule(instances, row, schedule).objective > 60
 
 
 @pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", README))))

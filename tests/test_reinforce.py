@@ -76,7 +76,8 @@ def test_router_learns_with_every_baseline(baseline):
     test = UniformGenerator(15, 1, 2.0)(500, np.random.default_rng(1))
     nearest = collected_value(test, nearest_feasible(test)).mean().item()
     env = make_env("router", 64, 15, 2.0)
-    network = dict(embed_dim=32, n_layers=1, n_heads=4, ff_dim=64)
+    # With geometry it would begin as good as nearest_feasible.
+    network = dict(embed_dim=32, n_layers=1, n_heads=4, ff_dim=64, geometry=False)
     model = make_model(
         "router", baseline, env, n_samples=4, learning_rate=2e-3, policy_kwargs=network, instances_per_epoch=640
     )
@@ -93,7 +94,9 @@ def test_allocator_learns_to_split():
     """Giving all tasks to one UAV, where an untrained network starts, is far from what the fleet can do."""
     test = UniformGenerator(8, 2, 1.2)(300, np.random.default_rng(1))
     env = make_env("allocator", 64, 8)
-    model = make_model("allocator", "shared", env, n_samples=6, learning_rate=2e-3, normalize_advantage=True)
+    # With geometry it would begin with an even split.
+    kwargs: dict[str, Any] = dict(n_samples=6, learning_rate=2e-3, policy_kwargs={**SMALL, "geometry": False})
+    model = make_model("allocator", "shared", env, normalize_advantage=True, **kwargs)
     problem = model.problem
 
     def objective() -> float:
@@ -122,14 +125,16 @@ def test_loss_is_the_papers(baseline):
             evaluation = algorithm.policy.evaluate_episodes(batch.instances, batch.actions)
             mean = {"none": 0.0, "shared": batch.returns.mean(1, keepdim=True)}.get(baseline, batch.returns.mean())
             loss = ((mean - batch.returns).float() * evaluation.log_prob.sum(-1)).mean()
-            gradients["expected"] = th.autograd.grad(loss, algorithm.policy.action_net.weight)[0]
+            gradients["expected"] = th.autograd.grad(loss, algorithm.policy.features_extractor.scorer.score.weight)[0]
 
         def _on_step(self) -> bool:
             return True
 
     model.max_grad_norm = 1e9
     model.learn_instances(4, Spy())
-    th.testing.assert_close(model.policy.action_net.weight.grad, gradients["expected"], atol=1e-5, rtol=1e-4)
+    th.testing.assert_close(
+        model.policy.features_extractor.scorer.score.weight.grad, gradients["expected"], atol=1e-5, rtol=1e-4
+    )
 
 
 def test_shared_baseline_is_the_mean_of_the_samples():
@@ -160,7 +165,9 @@ def test_rollout_baseline_uses_the_current_router():
 
 
 def test_rollout_baseline_is_replaced_only_when_better():
-    model = make_model("router", "rollout", make_env("router", 16, 10, 2.0), baseline_kwargs=dict(n_test_instances=200))
+    kwargs: dict[str, Any] = dict(policy_kwargs={**SMALL, "geometry": False})
+    env = make_env("router", 16, 10, 2.0)
+    model = make_model("router", "rollout", env, baseline_kwargs=dict(n_test_instances=200), **kwargs)
     model.set_logger(Logger(None, []))
     start = {name: value.clone() for name, value in model.baseline_policy.state_dict().items()}
     # In the first epoch the moving average stands in.
@@ -169,7 +176,8 @@ def test_rollout_baseline_is_replaced_only_when_better():
     assert model.logger.name_to_value["train/baseline_replaced"] == 0
     assert all(th.equal(value, start[name]) for name, value in model.baseline_policy.state_dict().items())
 
-    good = make_model("router", "shared", make_env("router", 32, 10, 2.0), learning_rate=3e-3).learn_instances(32 * 60)
+    env = make_env("router", 32, 10, 2.0)
+    good = make_model("router", "shared", env, learning_rate=3e-3, **kwargs).learn_instances(32 * 60)
     model.policy.load_state_dict(good.policy.state_dict())
     model._baseline.end_epoch(model.problem)
     assert model.logger.name_to_value["train/baseline_replaced"] == 1

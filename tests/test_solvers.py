@@ -60,7 +60,9 @@ def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
     """Of any instance that is allowed; and as every task has a UAV, some task is visited if any can be reached."""
     reachable = batch.reachable().any(1).tolist()
     pair = make_pair(batch.n_uavs, decode="sampling", samples=3)
-    for solver in (*map(make_solver, HEURISTICS), pair, make_pair(batch.n_uavs), make_kmeans_am()):
+    augmented = make_pair(batch.n_uavs, decode="augment", samples=2 * dl_drl.N_TOURS)
+    pairs = (pair, augmented, make_pair(batch.n_uavs), make_kmeans_am())
+    for solver in (*map(make_solver, HEURISTICS), *pairs):
         objectives(solver, batch)
         visited = [result.schedule.n_visited > 0 for result in solver.solve(batch)]
         assert visited == reachable, solver.name
@@ -136,10 +138,11 @@ def test_greedy_is_the_policies_own_plan(instances: Instances) -> None:
     pair = make_pair()
     found = routes(pair, instances)
     for row, schedule in enumerate(found):
-        assignment = pair.allocator.decode_episodes(instances[row])[0, 0].tolist()
-        assert len(schedule) == 3
+        order = pair.allocator.task_order(instances[row])
+        assignment = pair.allocator.decode_episodes(instances[row].reorder(order))[0, 0].tolist()
+        assert len(schedule) == 3 and order[0].tolist() != sorted(order[0].tolist())
         for uav, route in enumerate(schedule):
-            mine = [task for task, owner in enumerate(assignment) if owner == uav]
+            mine = [task for task, owner in zip(order[0].tolist(), assignment, strict=True) if owner == uav]
             assert set(route) <= set(mine)
             if mine:
                 subset = Instances.from_arrays(instances.depot[row], instances.tasks[row, mine])
@@ -245,8 +248,35 @@ def test_policies_left_in_training_mode(instances: Instances) -> None:
 
 
 def test_wrong_fleet(instances: Instances) -> None:
+    """Only an allocator with a scorer for each UAV is bound to a fleet."""
+    bound = DLDRL(make_policy(AllocatorPolicy, 4, preset="paper"), make_policy(RouterPolicy))
     with pytest.raises(ValueError, match="trained for 4 UAVs, the instances have 3; use an allocator trained for 3"):
-        make_pair(4).solve(instances)
+        bound.solve(instances)
+    assert objectives(make_pair(4), instances).min() > 0
+
+
+def test_augmentation_is_never_worse_than_greedy(instances: Instances) -> None:
+    """The first view is the instance itself, and the first tour of each subset the greedy one."""
+    greedy = objectives(make_pair(), instances)
+    augmented = objectives(make_pair(decode="augment", samples=128), instances)
+    assert (augmented >= greedy).all() and augmented.sum() > greedy.sum()
+
+
+@pytest.mark.parametrize("samples", [1, 8, 50, 300])
+def test_augmentation_plans_no_more_tours_than_asked_for(
+    samples: int, instances: Instances, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = make_pair(decode="augment", samples=samples)
+    planned: list[int] = []
+    plan = pair.router.plan
+
+    def counting_plan(subsets: Instances, max_rows: int | None, n_tours: int, generator: th.Generator) -> th.Tensor:
+        planned.append(len(subsets) * n_tours)
+        return plan(subsets, max_rows, n_tours, generator)
+
+    monkeypatch.setattr(pair.router, "plan", counting_plan)
+    pair.solve(instances)
+    assert 0.6 * samples * 9 * 3 <= sum(planned) <= samples * 9 * 3
 
 
 @pytest.mark.parametrize(
@@ -338,8 +368,13 @@ def test_defaults_are_for_solvers_that_have_them() -> None:
         ("kmeans-nearest:restarts=__import__('os')", "must be of type int"),
         ("kmeans-nearest:restarts=1,restarts=2", "given the option 'restarts' twice"),
         ("kmeans-nearest:restarts=0", "at least 1 start"),
-        ("dl-drl", r"'dl-drl' needs the option allocator=<str>; it has: allocator=<str>, batch_size=<int>, decode=<str>"),
-        ("dl-drl:allocator=a.zip", "'dl-drl' needs the option router=<str>"),
+        (
+            "dl-drl:allocator=a.zip",
+            r"a\.zip is one zip of a pair, and its router is missing: give both, or the name of a pair",
+        ),
+        ("dl-drl:router=r.zip", r"r\.zip is one zip of a pair, and its allocator is missing"),
+        ("dl-drl:polish=-1", "polish is -1; give a number of seconds"),
+        ("dl-drl:time_limit=0", "time_limit of DL-DRL .greedy. is 0 seconds"),
         ("dl-drl-i:allocator=a.zip,router=r.zip,batch_size=few", "must be of type int"),
         ("kmeans-am:restarts=2", "'kmeans-am' needs the option router=<str>"),
     ],
@@ -361,5 +396,5 @@ def test_typed_options(monkeypatch: pytest.MonkeyPatch) -> None:
     solver: Any = make_solver("typed:number=1e-3,flag=true,text=a=b")
     # As JSON, because there True is not 1.
     assert json.dumps(solver.options) == json.dumps(dict(number=1e-3, flag=True, text="a=b"))
-    with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false"):
+    with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false, or 1 or 0"):
         make_solver("typed:flag=yes")

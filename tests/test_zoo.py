@@ -355,7 +355,7 @@ def test_shipped_routers_build():
     callbacks = [callback for entry in shipped().values() for callback in entry.get("callback", [])]
     strategies = [callback.get("sb3_uav.training.ITSCallback") for callback in callbacks]
     routers = [strategy["router"] for strategy in strategies if strategy is not None]
-    assert len(routers) == 12 + 4 + 1
+    assert len(routers) == 12 + 4 + 1 + 1
     for router in routers:
         settings = {key: value for key, value in router.items() if key not in ("algo", "n_envs", "policy")}
         assert router["algo"] == "reinforce" and router["policy"] == "RouterPolicy"

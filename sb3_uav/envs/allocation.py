@@ -1,4 +1,4 @@
-"""Task allocation (the paper's upper level): every task, one a step in input order, is given to a UAV."""
+"""Task allocation (the paper's upper level): every task, one a step, is given to a UAV."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from sb3_uav.envs.instances import InstanceGenerator, Instances, make_generator
 from sb3_uav.envs.problem import Dynamics, Problem
 from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import Schedule
+from sb3_uav.envs.sweep import sweep_order
 
 UNASSIGNED = -1
+TASK_ORDERS = ("input", "sweep")
 
 
 class AllocationState(NamedTuple):
@@ -162,11 +164,28 @@ class AllocationProblem(Problem):
 
     :param generator: Draws the instances
     :param router: Plans the tours of the reward; nearest feasible task when None
+    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot
+    :raises ValueError: If there is no such order
     """
 
-    def __init__(self, generator: InstanceGenerator, router: Router | None = None) -> None:
+    def __init__(self, generator: InstanceGenerator, router: Router | None = None, task_order: str = "input") -> None:
         super().__init__(generator)
         self.router: Router = router or nearest_feasible
+        self.task_order = task_order
+
+    @property
+    def task_order(self) -> str:
+        """In which order the tasks are shown."""
+        return self._task_order
+
+    @task_order.setter
+    def task_order(self, task_order: str) -> None:
+        if task_order not in TASK_ORDERS:
+            raise ValueError(f"task_order is {task_order!r}; choose one of {TASK_ORDERS}.")
+        self._task_order = task_order
+
+    def arrange(self, instances: Instances) -> Instances:
+        return instances.reorder(sweep_order(instances)) if self.task_order == "sweep" else instances
 
     def _action_space(self) -> spaces.Discrete:
         return spaces.Discrete(self.generator.n_uavs)
@@ -219,10 +238,12 @@ class TaskAllocationEnv(ProblemEnv):
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
     :param router: Plans the tours of the reward; nearest feasible task when None
+    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot, as allocators
+        with ``sweep`` want them
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
     """
 
@@ -237,11 +258,16 @@ class TaskAllocationEnv(ProblemEnv):
         instances: Any = None,
         generator: InstanceGenerator | None = None,
         router: Router | None = None,
+        task_order: str = "input",
         render_mode: str | None = None,
     ) -> None:
         generator = generator or make_generator(n_tasks, n_uavs, max_distance, distribution, instances)
-        super().__init__(AllocationProblem(generator, router), render_mode)
+        super().__init__(AllocationProblem(generator, router, task_order), render_mode)
 
     def set_router(self, router: Router) -> None:
         """Use another router from the next reward on."""
         self.problem.router = router
+
+    def set_task_order(self, task_order: str) -> None:
+        """Show the tasks of the next episodes in another order."""
+        self.problem.task_order = task_order

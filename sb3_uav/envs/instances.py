@@ -216,6 +216,18 @@ class Instances:
             task_mask=self.task_mask[:, :n_tasks],
         )
 
+    def reorder(self, order: th.Tensor) -> Instances:
+        """
+        Put the tasks into another order.
+
+        :param order: ``(batch, n_tasks)`` int64, which task comes first, second, ...; padded tasks stay at the end
+        """
+        return replace(
+            self,
+            tasks=self.tasks.gather(1, order[..., None].expand(-1, -1, 2)),
+            values=self.values.gather(1, order),
+        )
+
     def pad(self, n_tasks: int) -> Instances:
         """Append padded task slots (at the depot, value 0) up to ``n_tasks``."""
         missing = n_tasks - self.n_tasks
@@ -444,6 +456,68 @@ class ClusteredGenerator:
         return _with_unit_values(depot, tasks, self.max_distance, self.n_uavs)
 
 
+# With fewer tasks than these nearly any allocation visits all of them, and there is little to learn.
+TASKS_PER_UAV = 12
+# Small instances teach nearly as much as large ones and cost less, so there are more of them; 1 is uniform in the logarithm.
+SMALL_SIZES = 1.5
+# Not 1, as equally many tasks in all would need: large batches of small tensors waste less time on launching operations.
+FEWER_INSTANCES = 0.85
+
+
+@dataclass(frozen=True)
+class MixtureGenerator:
+    """
+    Training batches of one random size each: a number of tasks, a fleet of at least 2 UAVs and a maximum flight distance, so
+    that one network learns them all. Depot and tasks are uniform in the unit square.
+
+    Called like any other generator, it gives instances of the largest size.
+
+    :param n_tasks: Largest number of tasks
+    :param n_uavs: Largest fleet
+    :param max_distance: Maximum flight distance of every second batch; of the others 0.6 to 1.6 times as much
+    :param min_tasks: Smallest number of tasks
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 8
+    max_distance: float = 2.0
+    min_tasks: int = 40
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        if self.min_tasks < 1:
+            raise ValueError(f"min_tasks is {self.min_tasks}; give at least 1.")
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return UniformGenerator(self.n_tasks, self.n_uavs, self.max_distance)(batch_size, rng)
+
+    def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        :param batch_size: Number of instances of the smallest size; of larger ones there are fewer
+        :param rng: The source of randomness
+        :return: Instances of a random size
+        """
+        n_uavs = int(rng.integers(min(2, self.n_uavs), self.n_uavs, endpoint=True))
+        least = min(self.min_tasks, self.n_tasks)
+        fewest = min(max(least, TASKS_PER_UAV * n_uavs), self.n_tasks)
+        n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** SMALL_SIZES))
+        factor = 1.0 if rng.random() < 0.5 else rng.uniform(0.6, 1.6)
+        n_instances = max(round(batch_size * (least / n_tasks) ** FEWER_INSTANCES), 2)
+        return UniformGenerator(n_tasks, n_uavs, self.max_distance * factor)(n_instances, rng)
+
+
+def training_batch(generator: InstanceGenerator, batch_size: int, rng: np.random.Generator) -> Instances:
+    """
+    The instances of one update: what the generator gives, or what it prefers to train on.
+
+    :param generator: Any generator
+    :param batch_size: Number of instances; a generator of mixed sizes may give another one
+    :param rng: The source of randomness
+    """
+    return getattr(generator, "training_batch", generator)(batch_size, rng)
+
+
 @dataclass(frozen=True, eq=False)
 class FixedGenerator:
     """
@@ -466,7 +540,7 @@ class FixedGenerator:
         return self.instances[rng.integers(len(self.instances), size=batch_size)]
 
 
-GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator}
+GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator, "mixture": MixtureGenerator}
 
 
 def make_generator(
@@ -482,7 +556,7 @@ def make_generator(
     :param n_tasks: Number of tasks; ignored when ``instances`` is given
     :param n_uavs: Number of UAVs; ignored when ``instances`` is given
     :param max_distance: Maximum flight distance; ignored when ``instances`` is given
-    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Instances, or the path of an ``.npz`` file, to draw from instead of a distribution
     :raises ValueError: If an argument is not allowed
     """

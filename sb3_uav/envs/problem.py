@@ -157,6 +157,13 @@ class Problem(ABC):
         :return: Task indices from 0, per UAV
         """
 
+    def arrange(self, instances: Instances) -> Instances:
+        """
+        :param instances: Any instances
+        :return: They as episodes show them; tasks may stand in another order
+        """
+        return instances
+
     @staticmethod
     def observe_static(instances: Instances) -> dict[str, th.Tensor]:
         """The part of the observation that an episode keeps, float32 with leading dimension ``batch``."""
@@ -252,7 +259,7 @@ class Episodes:
                 f"The instance has {instances.n_tasks} tasks, but the observation space holds {n_tasks}; "
                 "make the environment with a larger n_tasks."
             )
-        return replace(instances.pad(n_tasks), n_uavs=n_uavs)
+        return replace(self.problem.arrange(instances).pad(n_tasks), n_uavs=n_uavs)
 
     def step(self, actions: np.ndarray) -> StepResult:
         """

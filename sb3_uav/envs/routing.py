@@ -164,7 +164,7 @@ class RoutePlanningEnv(ProblemEnv):
 
     :param n_tasks: Number of tasks
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"`` or ``"clustered"``
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
     :param render_mode: ``"human"``, ``"rgb_array"`` or None

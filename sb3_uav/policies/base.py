@@ -28,11 +28,36 @@ from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
 from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.policies.memory import rows_that_fit
 
-# The settings of the encoder, by preset; arguments of the policy override them one by one.
+# The settings of the networks, by preset; arguments of the policy override them one by one.
 PRESETS: dict[str, dict[str, Any]] = {
-    "default": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="instance", use_values=True),
+    # One network for every number of tasks and UAVs and every maximum flight distance.
+    "default": dict(
+        embed_dim=64,
+        n_layers=3,
+        n_heads=4,
+        ff_dim=256,
+        normalization="instance",
+        use_values=True,
+        relative=True,
+        geometry=True,
+        shared_scorer=True,
+        sweep=True,
+        mixed_precision=False,
+    ),
     # Section IV-A2 of the paper.
-    "paper": dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch", use_values=False),
+    "paper": dict(
+        embed_dim=128,
+        n_layers=3,
+        n_heads=8,
+        ff_dim=512,
+        normalization="batch",
+        use_values=False,
+        relative=False,
+        geometry=False,
+        shared_scorer=False,
+        sweep=False,
+        mixed_precision=False,
+    ),
 }
 
 
@@ -107,6 +132,10 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     # Which environment it is for, and an observation key that only this one has.
     environment: ClassVar[str]
     own_key: ClassVar[str]
+    # Settings of a preset that mean nothing to this level.
+    foreign_settings: ClassVar[frozenset[str]] = frozenset()
+    # Size of what follows the logits in the features, if the features begin with the logits of the actions.
+    context_dim: int | None = None
 
     def __init__(self, observation_space: spaces.Space, features_dim: int, **encoder_kwargs: Any) -> None:
         super().__init__(observation_space, features_dim)
@@ -255,12 +284,17 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param action_space: Of the same environment
     :param lr_schedule: Learning rate schedule (could be constant)
     :param preset: ``"default"``, or ``"paper"`` for the network of the paper
-    :param embed_dim: Size of the embeddings; the preset's when None, like the next five
+    :param embed_dim: Size of the embeddings; the preset's when None, like the next ten
     :param n_layers: Number of attention layers
     :param n_heads: Number of heads
     :param ff_dim: Hidden size of the feed-forward sublayers
     :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param use_values: Whether task values are features of the encoder
+    :param relative: Whether networks see coordinates relative to the depot in units of the maximum flight distance
+    :param geometry: Whether decoders are told distances, slack and loads (the allocator needs ``shared_scorer`` for that)
+    :param shared_scorer: Whether one scorer judges all UAVs of the allocator, so that it serves fleets of any size
+    :param sweep: Whether the allocator wants the tasks in the order of :func:`~sb3_uav.envs.sweep.sweep_order`
+    :param mixed_precision: Whether encoders compute in bfloat16 where that is safe
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
     :param activation_fn: Activation function of ``net_arch``
     :param ortho_init: Whether to use SB3's orthogonal initialization
@@ -284,6 +318,11 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         ff_dim: int | None = None,
         normalization: str | None = None,
         use_values: bool | None = None,
+        relative: bool | None = None,
+        geometry: bool | None = None,
+        shared_scorer: bool | None = None,
+        sweep: bool | None = None,
+        mixed_precision: bool | None = None,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = False,
@@ -302,9 +341,15 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
             ff_dim=ff_dim,
             normalization=normalization,
             use_values=use_values,
+            relative=relative,
+            geometry=geometry,
+            shared_scorer=shared_scorer,
+            sweep=sweep,
+            mixed_precision=mixed_precision,
         )
         self._own_parameters: dict[str, Any] = {"preset": preset, **given}
         settings = {**PRESETS[preset], **{key: value for key, value in given.items() if value is not None}}
+        own_settings = {key: settings[key] for key in settings.keys() - self.extractor_class.foreign_settings}
         super().__init__(
             observation_space,
             action_space,
@@ -313,7 +358,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
             activation_fn=activation_fn,
             ortho_init=ortho_init,
             features_extractor_class=self.extractor_class,
-            features_extractor_kwargs=settings,
+            features_extractor_kwargs=own_settings,
             normalize_images=False,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -343,14 +388,52 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         """
         return rows_that_fit(self.device, n_nodes, n_subsets)
 
-    # ---------------------------------------------------------------------------------------------------- decoding
+    # ---------------------------------------------------------------------------------------------------- heads
 
-    @abstractmethod
+    def _build_mlp_extractor(self) -> None:
+        # Where features begin with logits, whose number varies, the critic's layers see only what follows.
+        features_dim = self.features_dim
+        self.features_dim = self.features_extractor.context_dim or features_dim
+        super()._build_mlp_extractor()
+        self.features_dim = features_dim
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        if self.features_extractor.context_dim is not None:
+            self.action_net = nn.Identity()
+            self.mlp_extractor.policy_net = nn.Sequential()
+            self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
     def _heads(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: ``(..., features)``
         :return: Unmasked logits ``(..., n_actions)``, values ``(...)``
         """
+        context_dim = self.features_extractor.context_dim
+        if context_dim is None:
+            logits = self.action_net(self.mlp_extractor.forward_actor(features))
+        else:
+            logits, features = features[..., :-context_dim], features[..., -context_dim:]
+        return logits, self.value_net(self.mlp_extractor.forward_critic(features)).squeeze(-1)
+
+    # ---------------------------------------------------------------------------------------------------- decoding
+
+    def task_order(self, instances: Instances, variant: int = 0) -> th.Tensor:
+        """
+        The order in which the policy wants to meet the tasks.
+
+        :param instances: ``batch`` instances
+        :param variant: 0 for the best order it knows; others are worth a try
+        :return: ``(batch, n_tasks)`` int64, which task comes first, second, ...
+        """
+        return th.arange(instances.n_tasks, device=instances.device).expand(len(instances), -1)
+
+    def arrange(self, instances: Instances) -> Instances:
+        """
+        :param instances: Any instances
+        :return: They with their tasks in the order in which the policy wants them
+        """
+        return instances.reorder(self.task_order(instances))
 
     def encode(self, instances: Instances) -> Cache:
         """

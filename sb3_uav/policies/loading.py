@@ -23,6 +23,7 @@ PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 # A parameter that only one of the policies has.
 SIGNATURES: dict[str, type[EpisodicPolicy]] = {
     "features_extractor.project_context.weight": AllocatorPolicy,
+    "features_extractor.scorer.project_uav.weight": AllocatorPolicy,
     "features_extractor.project_graph.weight": RouterPolicy,
 }
 # Stock A2C puts its optimizer class, which JSON cannot hold, into policy_kwargs; acting needs no optimizer.

@@ -7,18 +7,22 @@ from typing import NamedTuple
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule, TensorDict
+from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
+from torch.nn import functional
 
 from sb3_uav.envs.instances import Instances, UniformGenerator
-from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState
+from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value
 from sb3_uav.policies.base import Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import StaticObservation, attend
+from sb3_uav.policies.geometry import N_MOVE_FEATURES, MoveGeometry
 
 # Logits are clipped to +-10 (paper, equation of u; Bello et al.).
 LOGIT_CLIP = 10.0
+# Hidden size of the geometric bias, and how steeply it prefers near tasks before training.
+BIAS_DIM, NEAREST_FIRST = 32, 4.0
 # Into how many chunks by size subsets are cut before they are padded.
-SIZE_CLASSES = 4
+SIZE_CLASSES = 2
 
 
 class RouterState(NamedTuple):
@@ -31,6 +35,39 @@ class RouterState(NamedTuple):
     position: th.Tensor
     remaining_distance: th.Tensor
     action_mask: th.Tensor
+
+
+class MoveBias(nn.Module):
+    """
+    What the geometry of a move, together with the embeddings, adds to its scores.
+
+    It starts as a preference for near tasks: twice as far away is ``2**NEAREST_FIRST`` times less likely.
+
+    :param embed_dim: Size of the embeddings
+    :param n_scores: How many scores a move has
+    """
+
+    def __init__(self, embed_dim: int, n_scores: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(N_MOVE_FEATURES, n_scores)
+        self.project_features = nn.Linear(N_MOVE_FEATURES, BIAS_DIM)
+        self.project_node = nn.Linear(embed_dim, BIAS_DIM, bias=False)
+        self.project_query = nn.Linear(embed_dim, BIAS_DIM, bias=False)
+        self.score = nn.Linear(BIAS_DIM, n_scores)
+        for parameter in (*self.linear.parameters(), *self.score.parameters()):
+            nn.init.zeros_(parameter)
+        with th.no_grad():
+            self.linear.weight[-1, 1] = -NEAREST_FIRST
+
+    def forward(self, features: th.Tensor, nodes: th.Tensor, query: th.Tensor) -> th.Tensor:
+        """
+        :param features: ``(batch, n_samples, n_nodes, N_MOVE_FEATURES)``
+        :param nodes: ``(batch, n_nodes, BIAS_DIM)``, the projected nodes
+        :param query: ``(batch, n_samples, embed_dim)``, where the UAV is and what it can still fly
+        :return: ``(batch, n_samples, n_nodes, n_scores)``
+        """
+        mixed = self.project_features(features) + nodes[:, None] + self.project_query(query)[:, :, None]
+        return self.linear(features) + self.score(mixed.relu())
 
 
 class RouterExtractor(EpisodicExtractor):
@@ -46,10 +83,14 @@ class RouterExtractor(EpisodicExtractor):
     :param ff_dim: Hidden size of the feed-forward sublayers
     :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param use_values: Whether task values are features of the encoder
+    :param relative: Whether the encoder sees scaled coordinates relative to the depot
+    :param geometry: Whether distances and slack add a learned bias to the scores of the glimpse and to the compatibilities
+    :param mixed_precision: Whether the encoder computes in bfloat16
     """
 
     environment = "RoutePlanning"
     own_key = "position"
+    foreign_settings = frozenset({"shared_scorer", "sweep"})
 
     def __init__(
         self,
@@ -60,6 +101,9 @@ class RouterExtractor(EpisodicExtractor):
         ff_dim: int = 512,
         normalization: str = "instance",
         use_values: bool = True,
+        relative: bool = False,
+        geometry: bool = False,
+        mixed_precision: bool = False,
     ) -> None:
         super().__init__(
             observation_space,
@@ -70,19 +114,26 @@ class RouterExtractor(EpisodicExtractor):
             ff_dim=ff_dim,
             normalization=normalization,
             use_values=use_values,
+            relative=relative,
+            mixed_precision=mixed_precision,
         )
-        self.embed_dim = embed_dim
+        self.embed_dim = self.context_dim = embed_dim
         self.n_heads = n_heads
         self.project_graph = nn.Linear(embed_dim, embed_dim, bias=False)
         self.project_step = nn.Linear(embed_dim + 1, embed_dim, bias=False)
         self.project_nodes = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_glimpse = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.scaled = relative or geometry
+        self.move_bias = MoveBias(embed_dim, n_heads + 1) if geometry else None
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
         real = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)[..., None]
         graph = nodes.masked_fill(~real, 0.0).sum(1) / real.sum(1)
         glimpse_key, glimpse_value, logit_key = self.project_nodes(nodes).chunk(3, dim=-1)
-        return Cache(nodes, (self.project_graph(graph)[:, None], glimpse_key, glimpse_value, logit_key))
+        # What the remaining distance is measured in.
+        unit = static.max_distance if self.scaled else th.ones_like(static.max_distance)
+        geometry = () if self.move_bias is None else (self.move_bias.project_node(nodes), *MoveGeometry.of(static))
+        return Cache(nodes, (self.project_graph(graph)[:, None], glimpse_key, glimpse_value, logit_key, unit, *geometry))
 
     def observed_state(self, cache: Cache, observation: TensorDict) -> RouterState:
         return RouterState(
@@ -92,15 +143,21 @@ class RouterExtractor(EpisodicExtractor):
         )
 
     def decode(self, cache: Cache, state: RouterState) -> th.Tensor:
-        graph, glimpse_key, glimpse_value, logit_key = cache.projections
+        graph, glimpse_key, glimpse_value, logit_key, unit, *rest = cache.projections
         here = cache.nodes.gather(1, state.position[..., None].expand(-1, -1, self.embed_dim))
-        step = th.cat([here, state.remaining_distance[..., None]], dim=-1)
-        query = graph + self.project_step(step)
-        attention_bias = th.zeros_like(state.action_mask, dtype=query.dtype).masked_fill(~state.action_mask, -th.inf)
-        heads = attend(query, glimpse_key, glimpse_value, self.n_heads, attention_bias[:, None])
+        remaining = state.remaining_distance / unit
+        glimpse_bias = th.zeros_like(state.action_mask, dtype=here.dtype)[:, None]
+        logit_bias = glimpse_bias[:, 0]
+        query = graph + self.project_step(th.cat([here, remaining[..., None]], dim=-1))
+        if self.move_bias is not None:
+            features = MoveGeometry(*rest[1:]).features(state.position, remaining, state.action_mask)
+            bias = self.move_bias(features, rest[0], query).movedim(-1, 1)
+            glimpse_bias, logit_bias = bias[:, :-1], bias[:, -1]
+        attention_bias = glimpse_bias.masked_fill(~state.action_mask[:, None], -th.inf)
+        heads = attend(query, glimpse_key, glimpse_value, self.n_heads, attention_bias)
         glimpse = self.project_glimpse(heads)
         compatibility = glimpse @ logit_key.transpose(1, 2) / math.sqrt(self.embed_dim)
-        return th.cat([LOGIT_CLIP * compatibility.tanh(), glimpse], dim=-1)
+        return th.cat([LOGIT_CLIP * compatibility.tanh() + logit_bias, glimpse], dim=-1)
 
 
 class RouterPolicy(EpisodicPolicy):
@@ -118,23 +175,6 @@ class RouterPolicy(EpisodicPolicy):
     def placeholder_spaces(cls, n_actions: int | None) -> tuple[spaces.Dict, spaces.Discrete]:
         problem = RoutingProblem(UniformGenerator(n_tasks=1, n_uavs=1))
         return problem.observation_space, problem.action_space
-
-    def _build_mlp_extractor(self) -> None:
-        # The heads see the glimpse alone; the compatibilities are logits already, and their number varies.
-        features_dim, self.features_dim = self.features_dim, self.features_extractor.embed_dim
-        super()._build_mlp_extractor()
-        self.features_dim = features_dim
-
-    def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)
-        self.action_net = nn.Identity()
-        self.mlp_extractor.policy_net = nn.Sequential()
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
-
-    def _heads(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        embed_dim = self.features_extractor.embed_dim
-        logits, glimpse = features[..., :-embed_dim], features[..., -embed_dim:]
-        return logits, self.value_net(self.mlp_extractor.forward_critic(glimpse)).squeeze(-1)
 
     @staticmethod
     def _decoder_state(dynamics: RoutingDynamics, state: RoutingState) -> RouterState:
@@ -165,14 +205,22 @@ class RouterPolicy(EpisodicPolicy):
         return stacked, stacked.action_mask
 
     @th.no_grad()
-    def plan(self, instances: Instances, max_rows: int | None = None) -> th.Tensor:
+    def plan(
+        self,
+        instances: Instances,
+        max_rows: int | None = None,
+        n_tours: int = 1,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
         """
-        Plan tours greedily: the router of allocation environments and solvers.
+        Plan tours: the router of allocation environments and solvers.
 
         Rows are taken in order of size, so that small subsets are not padded to the largest.
 
         :param instances: ``batch`` single-UAV instances, on any device
         :param max_rows: How many rows to decode at once; as many as memory allows when None
+        :param n_tours: How many tours to try for each: the greedy one and samples, of which the best is kept
+        :param generator: Source of randomness of the samples, on the policy's device
         :return: ``(batch, n_steps)`` int64 node indices padded with the depot, on the device of the instances
         """
         self.set_training_mode(False)
@@ -183,9 +231,26 @@ class RouterPolicy(EpisodicPolicy):
         start, longest = 0, 1
         while start < len(order):
             largest = sorted_sizes[min(start + chunk, len(order)) - 1]
-            rows = order[start : start + min(chunk, self.rows_that_fit(largest + 1))]
+            rows = order[start : start + min(chunk, max(self.rows_that_fit(largest + 1) // n_tours, 1))]
             subsets = instances[rows].trim(largest).to(self.device)
-            tours = self.decode_episodes(subsets)[:, 0].to(instances.device)
+            tours = self._best_tours(subsets, n_tours, generator).to(instances.device)
             planned[rows, : tours.shape[1]] = tours
             start, longest = start + len(rows), max(longest, tours.shape[1])
         return planned[:, :longest]
+
+    def _best_tours(self, instances: Instances, n_tours: int, generator: th.Generator | None) -> th.Tensor:
+        """
+        :param instances: ``batch`` instances on the policy's device
+        :param n_tours: How many tours to try for each
+        :param generator: Source of randomness
+        :return: ``(batch, n_steps)``
+        """
+        cache = self.encode(instances)
+        greedy = self.decode_episodes(instances, cache=cache)
+        if n_tours == 1:
+            return greedy[:, 0]
+        sampled = self.decode_episodes(instances, n_tours - 1, False, generator, cache)
+        n_steps = max(greedy.shape[2], sampled.shape[2])
+        tours = th.cat([functional.pad(part, (0, n_steps - part.shape[2]), value=DEPOT) for part in (greedy, sampled)], dim=1)
+        best = collected_value(instances, tours).argmax(1)
+        return tours[th.arange(len(tours), device=tours.device), best]

@@ -168,6 +168,7 @@ class RolloutBaseline(Baseline):
         policy, copy = self.model.policy, self.model.baseline_policy
         draw = getattr(problem.generator, "held_out", problem.generator)
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
+        instances = copy.arrange(instances)
         gains = []
         for rows in th.arange(len(instances)).split(TEST_ROWS):
             part = instances[rows].to(self.model.device)

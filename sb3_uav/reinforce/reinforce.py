@@ -26,7 +26,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.instances import Instances, training_batch
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
@@ -223,10 +223,11 @@ class REINFORCE(OnPolicyAlgorithm):
         The training instances of one update; the same ones whenever asked.
 
         :param index: Number of the update, from 0
-        :return: ``n_envs`` instances on the CPU
+        :return: The instances on the CPU, ``n_envs`` unless the generator mixes sizes, their tasks as the policy wants them
         """
-        assert self.problem is not None
-        return self.problem.generator(self.n_envs, random_stream(self.stream_seed, TRAINING_STREAM, index))
+        assert self.problem is not None and isinstance(self.policy, EpisodicPolicy)
+        rng = random_stream(self.stream_seed, TRAINING_STREAM, index)
+        return self.policy.arrange(training_batch(self.problem.generator, self.n_envs, rng))
 
     def action_generator(self, counter: int) -> th.Generator:
         """
@@ -298,8 +299,8 @@ class REINFORCE(OnPolicyAlgorithm):
         """
         Count the steps and call the callbacks as SB3's loop would have: once per ``n_envs`` steps.
 
-        :param returns: ``(n_envs, n_samples)``
-        :param lengths: ``(n_envs, n_samples)``
+        :param returns: ``(batch, n_samples)``
+        :param lengths: ``(batch, n_samples)``
         :return: False if a callback wants to stop
         """
         batched = env.unwrapped if isinstance(env.unwrapped, BatchedVecEnv) else None
@@ -307,9 +308,9 @@ class REINFORCE(OnPolicyAlgorithm):
             n_calls = math.ceil(lengths[:, sample].sum() / self.n_envs)
             for call in range(n_calls):
                 last = call == n_calls - 1
-                dones = np.full(self.n_envs, last)
-                rewards = returns[:, sample].astype(np.float32) if last else np.zeros(self.n_envs, dtype=np.float32)
-                infos: list[dict[str, Any]] = [{} for _ in range(self.n_envs)]
+                dones = np.full(len(returns), last)
+                rewards = returns[:, sample].astype(np.float32) if last else np.zeros(len(returns), dtype=np.float32)
+                infos: list[dict[str, Any]] = [{} for _ in range(len(returns))]
                 if last:
                     for info, episode_return, length in zip(infos, returns[:, sample], lengths[:, sample], strict=True):
                         info["episode"] = {"r": float(episode_return), "l": int(length)}
@@ -325,11 +326,8 @@ class REINFORCE(OnPolicyAlgorithm):
     def train(self) -> None:
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        if self._batch is not None:
-            batch, self._batch = self._batch, None
-            loss = self._episode_loss(batch)
-        else:
-            loss = self._step_loss()
+        batch, self._batch = self._batch, None
+        loss = self._step_loss() if batch is None else self._episode_loss(batch)
         self.policy.optimizer.zero_grad()
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
@@ -342,7 +340,7 @@ class REINFORCE(OnPolicyAlgorithm):
         problem = self.problem
         if problem is not None:
             self.n_batches += 1
-            self.n_instances += self.n_envs
+            self.n_instances += self.n_envs if batch is None else len(batch.instances)
             self.logger.record("train/epoch", self.epoch)
             if self.n_instances >= (self.epoch + 1) * self.instances_per_epoch:
                 self._baseline.end_epoch(problem)

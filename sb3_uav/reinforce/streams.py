@@ -6,6 +6,7 @@ import numpy as np
 
 # Which numbers are drawn. The streams are disjoint, from each other and from generators that were seeded with a plain number.
 TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM, SUBSET_STREAM, FIXED_SET_STREAM, FIXED_SET_ACTION_STREAM = range(6)
+WARM_START_STREAM = 6
 
 
 def random_stream(seed: int, *key: int) -> np.random.Generator:

@@ -154,7 +154,7 @@ class OneByOneSolver(Solver):
 SOLVERS: dict[str, str] = {
     "dl-drl": "sb3_uav.solvers.dl_drl:load_dl_drl",
     # The paper's name for pairs whose router was not trained with the allocator.
-    "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl",
+    "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl_i",
     "kmeans-am": "sb3_uav.solvers.kmeans_am:load_kmeans_am",
     "greedy-insertion": "sb3_uav.solvers.insertion:GreedyInsertion",
     "milp": "sb3_uav.solvers.milp:MILP",
@@ -255,9 +255,9 @@ def _parse_value(what: str, value: str, kind: type) -> Any:
     :raises ValueError: If the text is not of that type
     """
     if kind is bool:
-        if value.lower() not in ("true", "false"):
-            raise ValueError(f"{what} must be true or false.")
-        return value.lower() == "true"
+        if value.lower() not in ("true", "false", "1", "0"):
+            raise ValueError(f"{what} must be true or false, or 1 or 0.")
+        return value.lower() in ("true", "1")
     try:
         return kind(value)
     except ValueError as error:

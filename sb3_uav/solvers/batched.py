@@ -38,11 +38,14 @@ class BatchedSolver(Solver):
         """
 
     @abstractmethod
-    def solve_batch(self, instances: Instances, rows: Sequence[int], seed: int) -> list[Schedule]:
+    def solve_batch(
+        self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
+    ) -> list[Schedule]:
         """
         :param instances: ``batch`` instances, trimmed to the largest of them
         :param rows: Their indices in what is being solved, on which random numbers depend
         :param seed: Of all the randomness
+        :param time_limit: Seconds per instance, on average, for solvers that use it
         :return: A schedule for each
         """
 
@@ -57,7 +60,7 @@ class BatchedSolver(Solver):
             start = time.perf_counter()
             batch = instances[taken]
             n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
-            found = self.solve_batch(batch.trim(n_tasks), taken, seed)
+            found = self.solve_batch(batch.trim(n_tasks), taken, seed, time_limit)
             seconds = (time.perf_counter() - start) / len(taken)
             for row, schedule in zip(taken, found, strict=True):
                 yield row, SolverResult(schedule, seconds, len(taken))

@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+import math
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
+from torch.nn import functional
 
-from sb3_uav.envs.allocation import plan_tours, schedules
+from sb3_uav.envs.allocation import PlannedTours, plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
+from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
 from sb3_uav.policies.loading import load_policy
+from sb3_uav.pretrained import pair_files
 from sb3_uav.solvers.batched import BatchedSolver, parameters_hash
+from sb3_uav.solvers.limits import deadline_after
+from sb3_uav.solvers.refinement import Refinement
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
-DECODINGS = ("greedy", "sampling")
+DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
+# Augmentation looks at an instance in so many views, all symmetries swept in both directions, and tries so many tours for each
+# subset of tasks; allocations times tours are the samples.
+N_VIEWS = 2 * N_SYMMETRIES
+N_TOURS = 8
+# Under a time limit less is done between two looks at the clock.
+HURRIED_BLOCK, HURRIED_VIEWS = 16, 4
 
 
 def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
@@ -40,17 +52,23 @@ def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
 
 class DLDRL(BatchedSolver):
     """
-    DL-DRL: an allocator and a router, both trained.
+    DL-DRL: an allocator and a router, both trained; and what makes schedules better afterwards, if it is asked for.
 
     What it finds for an instance depends on the seed and the row of the instance, not on ``batch_size`` (but for rounding
-    errors of the networks). The router is always greedy.
+    errors of the networks, and but for time limits). The router is greedy, except with ``"augment"``.
 
     :param allocator: The upper level's policy
     :param router: The lower level's policy
-    :param decode: ``"greedy"``, or ``"sampling"`` to keep the best of several sampled allocations
-    :param samples: Number of sampled allocations per instance
+    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to spend
+        the samples on views of the instance (its symmetries, the sweep in both directions) and on several tours per UAV
+    :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
-    :param name: How tables and files call it; says how it decodes when None
+    :param name: How tables and files call it; says what it does when None
+    :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.solvers.local_search.repair`
+    :param polish: For how many seconds per instance to go on from the best, see :func:`~sb3_uav.solvers.refinement.polish`
+    :param time_limit: Seconds per instance in all, on average over a batch, when :meth:`solve` is given none: a part of them
+        limits the number of samples, the rest is for repair and polish
+    :raises ImportError: If numba is needed and not installed
     :raises ValueError: If an argument is not allowed
     """
 
@@ -62,6 +80,9 @@ class DLDRL(BatchedSolver):
         samples: int = 128,
         batch_size: int | None = None,
         name: str | None = None,
+        repair: bool = False,
+        polish: float = 0.0,
+        time_limit: float | None = None,
     ) -> None:
         if decode not in DECODINGS:
             raise ValueError(f"decode is {decode!r}; choose one of {DECODINGS}.")
@@ -72,11 +93,18 @@ class DLDRL(BatchedSolver):
         self.router = router
         self.decode = decode
         self.samples = samples
+        self.refinement = Refinement(repair, polish)
+        self.time_limit = time_limit
+        # Plain networks come to an end by themselves.
+        self.uses_time_limit = self.refinement.is_wanted or time_limit is not None
         self.name = f"DL-DRL ({self._decoding})" if name is None else name
+        if time_limit is not None:
+            deadline_after(time_limit, self.name)
 
     @property
     def _decoding(self) -> str:
-        return f"sampling {self.samples}" if self.decode == "sampling" else "greedy"
+        decoding = "greedy" if self.decode == "greedy" else f"{self.decode} {self.samples}"
+        return decoding + self.refinement.label
 
     def untrained(self, seed: int = 0) -> DLDRL:
         """
@@ -85,42 +113,106 @@ class DLDRL(BatchedSolver):
         """
         allocator, router = freshly_initialised(self.allocator, seed), freshly_initialised(self.router, seed + 1)
         name = f"DL-DRL untrained{f' {seed}' if seed else ''} ({self._decoding})"
-        return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name)
+        refinement = (self.refinement.repair, self.refinement.polish, self.time_limit)
+        return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name, *refinement)
 
     def check(self, instances: Instances) -> None:
         self.allocator.check_fleet(instances)
 
     def settings(self) -> dict[str, Any]:
         networks = {"allocator": parameters_hash(self.allocator), "router": parameters_hash(self.router)}
-        return {**networks, "decoding": self._decoding}
+        limit = {} if self.time_limit is None else {"time_limit": self.time_limit}
+        return {**networks, "decoding": self._decoding, **limit}
 
     def rows_that_fit(self, instances: Instances) -> int:
-        n_samples = SAMPLE_BLOCK if self.decode == "sampling" else 1
+        n_samples = 1 if self.decode == "greedy" else SAMPLE_BLOCK
         return self.allocator.rows_that_fit(instances.n_tasks + 1, n_samples * instances.n_uavs)
 
-    def solve_batch(self, instances: Instances, rows: Sequence[int], seed: int) -> list[Schedule]:
+    def solve_batch(
+        self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
+    ) -> list[Schedule]:
+        if time_limit is None or not self.uses_time_limit:
+            time_limit = self.time_limit
+        start, seconds = time.perf_counter(), math.inf
+        if time_limit is not None:
+            deadline_after(time_limit, self.name)
+            seconds = time_limit * len(instances)
+        share = 1.0 - self.refinement.share
+        on_cpu, instances = instances, instances.to(self.allocator.device)
         self.allocator.set_training_mode(False)
-        instances = instances.to(self.allocator.device)
-        with th.no_grad():
-            cache = self.allocator.encode(instances)
-        if self.decode == "greedy":
-            planned = plan_tours(instances, self.allocator.decode_episodes(instances, cache=cache), self.router.plan)
-            return schedules(planned.tours[:, 0])
-        best_value = th.full((len(instances),), -th.inf, dtype=th.float64, device=instances.device)
-        best = [Schedule([])] * len(instances)
-        for first in range(0, self.samples, SAMPLE_BLOCK):
-            n_samples = min(SAMPLE_BLOCK, self.samples - first)
-            assignment = self._sample_block(instances, cache, rows, seed, first)[:, :n_samples]
-            planned = plan_tours(instances, assignment, self.router.plan)
-            value, sample = planned.value.max(1)
-            tours = planned.tours[th.arange(len(instances), device=sample.device), sample]
-            for row, (schedule, better) in enumerate(zip(schedules(tours), (value > best_value).tolist(), strict=True)):
-                if better:
-                    best[row] = schedule
-            best_value = th.maximum(best_value, value)
-        return best
+        found = Shortlists(len(instances), self.refinement.n_candidates)
+        # Of a first block nothing is known; afterwards none is begun that would probably end too late.
+        before = start
+        for block in self._blocks(instances, rows, seed, hurry=time_limit is not None):
+            found.add(block)
+            now = time.perf_counter()
+            if now + (now - before) > start + share * seconds:
+                break
+            before = now
+        return self.refinement(on_cpu, found.schedules(), start + seconds, seed)
 
-    def _sample_block(self, instances: Instances, cache: Cache, rows: Sequence[int], seed: int, first: int) -> th.Tensor:
+    def _blocks(self, instances: Instances, rows: Sequence[int], seed: int, hurry: bool) -> Iterator[Block]:
+        """
+        :param instances: ``batch`` instances on the allocator's device
+        :param rows: Their indices in what is being solved
+        :param seed: Of the samples
+        :param hurry: Whether to begin with the greedy decoding and to draw fewer samples at once
+        :return: Schedules for all instances, block by block
+        """
+        order = self.allocator.task_order(instances)
+        arranged = instances.reorder(order)
+        with th.no_grad():
+            cache = self.allocator.encode(arranged)
+        if self.decode == "greedy" or hurry:
+            assignment = self.allocator.decode_episodes(arranged, cache=cache)
+            yield Block.of(plan_tours(arranged, assignment, self.router.plan), order)
+        if self.decode == "sampling":
+            size = HURRIED_BLOCK if hurry else SAMPLE_BLOCK
+            for first in range(0, self.samples, size):
+                assignment = self._sample_block(arranged, cache, rows, seed, first, size)[:, : self.samples - first]
+                yield Block.of(plan_tours(arranged, assignment, self.router.plan), order)
+        elif self.decode == "augment":
+            yield from self._views(instances, rows, seed, hurry)
+
+    def _views(self, instances: Instances, rows: Sequence[int], seed: int, hurry: bool) -> Iterator[Block]:
+        """
+        :param instances: ``batch`` instances on the allocator's device
+        :param rows: Their indices in what is being solved
+        :param seed: Of the samples
+        :param hurry: Whether to look at few views at once
+        :return: Schedules of all views, of which each begins with a greedy allocation
+        """
+        n_tours = min(N_TOURS, self.samples)
+        n_allocations = self.samples // n_tours
+        size = HURRIED_VIEWS if hurry else N_VIEWS
+        for first in range(0, n_allocations, size):
+            views = [number % N_VIEWS for number in range(first, min(first + size, n_allocations))]
+            blocks = []
+            for i, row in enumerate(rows):
+                generator = random_generator(instances, seed, row, first)
+                blocks.append(self._look(instances[i], views, first >= N_VIEWS, n_tours, generator))
+            yield Block.concatenate(blocks)
+
+    def _look(self, instance: Instances, views: Sequence[int], sampled: bool, n_tours: int, generator: th.Generator) -> Block:
+        """
+        :param instance: A batch of one on the allocator's device
+        :param views: Numbers of the views
+        :param sampled: Whether to sample the allocation in each of them, instead of decoding it greedily
+        :param n_tours: How many tours to try for each subset
+        :param generator: The source of randomness
+        :return: The schedules
+        """
+        shown = [reflect(instance, view // 2) for view in views]
+        orders = th.cat([self.allocator.task_order(seen, view % 2) for view, seen in zip(views, shown, strict=True)])
+        arranged = Instances.concatenate(shown).reorder(orders)
+        assignment = self.allocator.decode_episodes(arranged, 1, not sampled, generator)
+        planned = plan_tours(arranged, assignment, lambda subsets: self.router.plan(subsets, None, n_tours, generator))
+        tours = in_input_order(planned.tours[:, 0], orders)
+        return Block(planned.value[:, 0][None], tours[None])
+
+    def _sample_block(
+        self, instances: Instances, cache: Cache, rows: Sequence[int], seed: int, first: int, size: int
+    ) -> th.Tensor:
         """
         Sample one block of allocations, instance by instance, each from random numbers of its own.
 
@@ -131,18 +223,128 @@ class DLDRL(BatchedSolver):
         :param rows: Their indices in what is being solved
         :param seed: Of the samples
         :param first: Index of the first sample of the block
-        :return: ``(batch, SAMPLE_BLOCK, n_tasks)`` int64
+        :param size: Of the block
+        :return: ``(batch, size, n_tasks)`` int64
         """
         blocks = []
         for i, row in enumerate(rows):
-            state = np.random.SeedSequence([seed, row, first]).generate_state(1, np.uint64)
-            generator = th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+            generator = random_generator(instances, seed, row, first)
             own = Cache(cache.nodes[i : i + 1], tuple(projection[i : i + 1] for projection in cache.projections))
-            blocks.append(self.allocator.decode_episodes(instances[i], SAMPLE_BLOCK, False, generator, own))
+            blocks.append(self.allocator.decode_episodes(instances[i], size, False, generator, own))
         return th.cat(blocks)
 
 
+class Block(NamedTuple):
+    """
+    Some schedules of every instance.
+
+    :param value: ``(batch, n_schedules)`` float64
+    :param tours: ``(batch, n_schedules, n_uavs, n_steps)`` int64, tasks in the order of the input, -1 as padding
+    """
+
+    value: th.Tensor
+    tours: th.Tensor
+
+    @classmethod
+    def of(cls, planned: PlannedTours, order: th.Tensor) -> Block:
+        """
+        :param planned: Tours of the tasks in another order
+        :param order: ``(batch, n_tasks)`` int64, which task stands in each place
+        """
+        return cls(planned.value, in_input_order(planned.tours.flatten(1, 2), order).view_as(planned.tours))
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Block]) -> Block:
+        """:param blocks: Of different instances with equally many UAVs, each with equally many schedules"""
+        n_steps = max(block.tours.shape[-1] for block in blocks)
+        padded = [functional.pad(block.tours, (0, n_steps - block.tours.shape[-1]), value=-1) for block in blocks]
+        return cls(th.cat([block.value for block in blocks]), th.cat(padded))
+
+
+class Shortlists:
+    """
+    The best schedules of every instance so far.
+
+    :param n_instances: Number of instances
+    :param length: How many to keep of each
+    """
+
+    def __init__(self, n_instances: int, length: int) -> None:
+        self.length = length
+        self._found: list[dict[Schedule, float]] = [{} for _ in range(n_instances)]
+
+    def add(self, block: Block) -> None:
+        """:param block: More schedules of the same instances"""
+        values, order = block.value.sort(dim=1, descending=True, stable=True)
+        for found, tours, value, places in zip(self._found, block.tours, values.tolist(), order, strict=True):
+            worst = min(found.values()) if len(found) >= self.length else -math.inf
+            new: dict[Schedule, float] = {}
+            for place, objective in zip(places, value, strict=True):
+                if objective <= worst or len(new) == self.length:
+                    break
+                new.setdefault(schedules(tours[place, None])[0], objective)
+            # This sort is stable too: of equal ones, those that were there before stay.
+            best = sorted((found | new).items(), key=lambda item: -item[1])
+            found.clear()
+            found.update(best[: self.length])
+
+    def schedules(self) -> list[list[Schedule]]:
+        """:return: For each instance, the best first"""
+        return [list(found) for found in self._found]
+
+
+def random_generator(instances: Instances, *seed: int) -> th.Generator:
+    """
+    :param instances: On the device where random numbers are needed
+    :param seed: What the random numbers depend on
+    """
+    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+    return th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+
+
+def in_input_order(tours: th.Tensor, order: th.Tensor) -> th.Tensor:
+    """
+    :param tours: ``(batch, n_uavs, n_steps)`` int64, places of tasks in the order, -1 as padding
+    :param order: ``(batch, n_tasks)`` int64, which task stands in each place
+    :return: The tours with the tasks themselves
+    """
+    tasks = order.gather(1, tours.clamp(min=0).flatten(1)).view_as(tours)
+    return tasks.masked_fill(tours < 0, -1)
+
+
 def load_dl_drl(
+    allocator: str | None = None,
+    router: str | None = None,
+    decode: str = "greedy",
+    samples: int = 128,
+    device: str = "auto",
+    batch_size: int | None = None,
+    repair: bool = False,
+    polish: float = 0.0,
+    time_limit: float | None = None,
+) -> DLDRL:
+    """
+    :param allocator: SB3 zip of the allocator, or the name of a pair that comes with the package; the default pair when None
+    :param router: SB3 zip of the router; that of the same pair when None
+    :param decode: ``"greedy"``, ``"sampling"`` or ``"augment"``
+    :param samples: Number of tours that are planned for every UAV of an instance
+    :param device: Device of the networks
+    :param batch_size: How many instances to solve at once; as many as memory allows when None
+    :param repair: Whether to repair the best of the schedules
+    :param polish: For how many seconds per instance to go on from the best
+    :param time_limit: Seconds per instance in all
+    :return: The solver
+    :raises FileNotFoundError: If a zip is missing
+    :raises ValueError: If a zip is damaged or holds another policy, or an argument is not allowed
+    """
+    files = pair_files(allocator, router)
+    networks = load_policy(files[0], device, AllocatorPolicy), load_policy(files[1], device, RouterPolicy)
+    solver = DLDRL(*networks, decode, samples, batch_size, None, repair, polish, time_limit)
+    solver.files = dict(zip(("allocator", "router"), files, strict=True))
+    return solver
+
+
+def load_dl_drl_i(
     allocator: str,
     router: str,
     decode: str = "greedy",
@@ -151,17 +353,8 @@ def load_dl_drl(
     batch_size: int | None = None,
 ) -> DLDRL:
     """
-    :param allocator: SB3 zip of the allocator
-    :param router: SB3 zip of the router
-    :param decode: ``"greedy"`` or ``"sampling"``
-    :param samples: Number of sampled allocations per instance
-    :param device: Device of the networks
-    :param batch_size: How many instances to solve at once; as many as memory allows when None
-    :return: The solver
-    :raises FileNotFoundError: If a zip is missing
-    :raises ValueError: If a zip is damaged or holds another policy, or an argument is not allowed
+    DL-DRL-I, whose router was not trained with the allocator: no such pair comes with the package.
+
+    The parameters are those of :func:`load_dl_drl`.
     """
-    networks = load_policy(allocator, device, AllocatorPolicy), load_policy(router, device, RouterPolicy)
-    solver = DLDRL(*networks, decode, samples, batch_size)
-    solver.files = {"allocator": Path(allocator), "router": Path(router)}
-    return solver
+    return load_dl_drl(allocator, router, decode, samples, device, batch_size)

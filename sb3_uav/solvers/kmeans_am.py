@@ -43,7 +43,9 @@ class KMeansAM(BatchedSolver):
     def rows_that_fit(self, instances: Instances) -> int:
         return self.router.rows_that_fit(instances.n_tasks + 1, instances.n_uavs)
 
-    def solve_batch(self, instances: Instances, rows: Sequence[int], seed: int) -> list[Schedule]:
+    def solve_batch(
+        self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
+    ) -> list[Schedule]:
         assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED)
         for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
             if n_tasks > 0:

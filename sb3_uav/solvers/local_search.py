@@ -111,9 +111,14 @@ class LocalSearch:
         return self._better(self._unload(plan), schedule)
 
     def improve(
-        self, schedule: Schedule, seconds: float | None = None, seed: int = 0, settings: AnnealingSettings | None = None
+        self,
+        schedule: Schedule,
+        seconds: float | None = None,
+        seed: int = 0,
+        settings: AnnealingSettings | None = None,
+        n_trials: int | None = None,
     ) -> Schedule:
-        """See :func:`improve`."""
+        """See :func:`improve`; ``n_trials`` is the number of trials where no time is given."""
         start = time.perf_counter()
         self.report(schedule)
         settings = settings or AnnealingSettings()
@@ -121,7 +126,8 @@ class LocalSearch:
         best = self._load(schedule)
         if len(self._tasks) > 0:
             if seconds is None:
-                kernels.anneal(plan, best, TRIALS_PER_TASK * len(self._tasks), 0.0, 1.0, settings)
+                n_trials = TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
+                kernels.anneal(plan, best, n_trials, 0.0, 1.0, settings)
             else:
                 self._anneal(plan, best, start, seconds, settings)
         kernels.measure_all(best)
@@ -157,7 +163,7 @@ def warm_up() -> None:
     """
     instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
     search = LocalSearch(instance)
-    search.repair(search.improve(Schedule([]), seconds=CHUNK_SECONDS / 10))
+    search.repair(search.improve(Schedule([])))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:

@@ -73,6 +73,15 @@ def polish_schedule(
     return max(found, schedule, key=lambda candidate: _total_value(instance, candidate))
 
 
+def has_pyvrp() -> bool:
+    """Whether a supported version is installed."""
+    try:
+        _require_pyvrp("pyvrp")
+    except ImportError:
+        return False
+    return True
+
+
 def _require_pyvrp(solver: str) -> Any:
     """
     :param solver: Name of the solver that needs it

@@ -3,6 +3,7 @@ from sb3_uav.training.fixed_set import FixedSetEvalCallback
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.its import ITSCallback
 from sb3_uav.training.pretrained_router import PretrainedRouterCallback
+from sb3_uav.training.size_grid import SizeGridCallback
 
 __all__ = [
     "EpisodeBufferCallback",
@@ -12,4 +13,5 @@ __all__ = [
     "ITSCallback",
     "MaskableEpisodeRolloutBuffer",
     "PretrainedRouterCallback",
+    "SizeGridCallback",
 ]

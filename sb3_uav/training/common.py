@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.envs.routing import Router
 from sb3_uav.envs.vec_env import BatchedVecEnv
+from sb3_uav.policies import AllocatorPolicy
 
 CallbackT = TypeVar("CallbackT", bound=BaseCallback)
 
@@ -84,13 +85,15 @@ def monitor_folder(env: VecEnv) -> Path | None:
 
 def hand_over_router(callback: BaseCallback, router: Router) -> None:
     """
-    Let rewards come from this router, in training and in SB3's evaluation.
+    Let rewards come from this router, in training and in SB3's evaluation, and tasks in the order that the allocator wants.
 
     :param callback: A callback of the allocator's training, which has started
     :param router: The router
     """
     for env in (callback.training_env, *(evaluation.eval_env for evaluation in siblings(callback, EvalCallback))):
         env.env_method("set_router", router)
+        if isinstance(callback.model.policy, AllocatorPolicy):
+            env.env_method("set_task_order", callback.model.policy.env_order)
 
 
 @contextmanager

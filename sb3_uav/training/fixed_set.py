@@ -181,7 +181,7 @@ def _evaluate_chunk(
     """
     :param first: Index of the first of these instances in the set
     """
-    part = instances.to(policy.device)
+    part = policy.arrange(instances).to(policy.device)
     cache = policy.encode(part)
     greedy = policy.decode_episodes(part, cache=cache)
     returns, lengths = problem.returns(part, greedy)[:, 0], problem.lengths(part, greedy)[:, 0]

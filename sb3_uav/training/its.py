@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import io
 import json
 import re
@@ -24,13 +25,14 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_uav.envs.allocation import AllocationProblem
+from sb3_uav.envs.instances import training_batch
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
 from sb3_uav.training.common import (
     CallbackT,
     find_run_folder,
@@ -159,11 +161,15 @@ class ITSCallback(BaseCallback):
 
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
+    :param warm_start: What gives the router a start before anything else, by its dotted path, and its arguments, as in
+        ``{"sb3_uav.solvers.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
+        the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`
     :param n_epochs: Allocator epochs (the paper's E)
     :param n_pretraining_epochs: Router epochs of pre-training (E_p)
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
+    :param router_instances_per_epoch: Instances of a router epoch, where they shall be others than those of the allocator
     :param strategy: ``"ITS"``, or one of the paper's ablations: ``"ITS/pre-training"`` (without pre-training),
         ``"ITS/intensive"`` (without intensive training), ``"ITS/pre-training&intensive"`` (neither), ``"independent"``
         (DL-DRL-I: the router is only pre-trained)
@@ -182,13 +188,19 @@ class ITSCallback(BaseCallback):
         n_intensive_epochs: int = 8,
         n_continuous_epochs: int = 4,
         instances_per_epoch: int | None = None,
+        router_instances_per_epoch: int | None = None,
         strategy: str = "ITS",
         save_path: str | None = None,
         resume_from: str | None = None,
         checkpoint_freq: int = 1,
         verbose: int = 0,
+        warm_start: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         super().__init__(verbose)
+        if warm_start is not None and (not isinstance(warm_start, dict) or len(warm_start) != 1):
+            raise ValueError(
+                f"warm_start must map the dotted path of one function to its arguments, found {warm_start!r:.80}."
+            )
         if strategy not in STRATEGIES:
             raise ValueError(f"strategy is {strategy!r}; choose one of {STRATEGIES}.")
         for name, value, least in (
@@ -198,6 +210,7 @@ class ITSCallback(BaseCallback):
             ("n_continuous_epochs", n_continuous_epochs, 1),
             ("checkpoint_freq", checkpoint_freq, 1),
             ("instances_per_epoch", 1 if instances_per_epoch is None else instances_per_epoch, 1),
+            ("router_instances_per_epoch", 1 if router_instances_per_epoch is None else router_instances_per_epoch, 1),
         ):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
@@ -209,10 +222,12 @@ class ITSCallback(BaseCallback):
         self.n_intensive_epochs = 0 if strategy.endswith("intensive") else n_intensive_epochs
         self.n_continuous_epochs = n_continuous_epochs
         self.instances_per_epoch = instances_per_epoch
+        self.router_instances_per_epoch = router_instances_per_epoch
         self.strategy = strategy
         self.save_path = None if save_path is None else Path(save_path)
         self.resume_from = None if resume_from is None else Path(resume_from)
         self.checkpoint_freq = checkpoint_freq
+        self.warm_start = warm_start
 
         self.records: list[EpochRecord] = []
         self.epoch = 0
@@ -264,6 +279,8 @@ class ITSCallback(BaseCallback):
                     "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
                     f"{CHECKPOINT_FOLDER} folder of the earlier run."
                 )
+            elif self.warm_start is not None:
+                self._start_router(self.warm_start)
             self._started = True
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
         self._instances_before = self.epoch * self.instances_per_epoch
@@ -303,7 +320,7 @@ class ITSCallback(BaseCallback):
         generator = WholeInstances(self.problem.generator)
         self._router_env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=generator)] * n_envs)
         if algorithm is REINFORCE:
-            kwargs.setdefault("instances_per_epoch", self.instances_per_epoch)
+            kwargs.setdefault("instances_per_epoch", self._router_epoch_size())
         # The next seed, because with the same one both levels would draw the same points.
         seed = None if self.model.seed is None else self.model.seed + 1
         try:
@@ -318,6 +335,24 @@ class ITSCallback(BaseCallback):
         folder = str(Path(self.logger.dir) / "router") if outputs and self.logger.dir else None
         self.router.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
         self._freezers = {"allocator": Freezer(self.model.policy), "router": Freezer(self.router.policy)}
+
+    def _start_router(self, warm_start: dict[str, dict[str, Any]]) -> None:
+        ((path, arguments),) = warm_start.items()
+        function = resolve_path(path, "warm_start")
+        rng = random_stream(self._seed(), WARM_START_STREAM)
+
+        def report(text: str) -> None:
+            if self.verbose > 0:
+                print(text, flush=True)
+
+        positional = (self.router.policy, self.model.policy, self.problem.generator, rng)
+        try:
+            call = inspect.signature(function).bind(*positional, **{"report": report, **(arguments or {})})
+        except TypeError as error:
+            raise ValueError(f"warm_start: these arguments do not fit {path}: {error}") from error
+        with undisturbed_random_state():
+            function(*call.args, **call.kwargs)
+        self._save_checkpoint()
 
     @property
     def _router_policy(self) -> BasePolicy:
@@ -424,7 +459,8 @@ class ITSCallback(BaseCallback):
 
     def _draw_new_batch(self, index: int) -> Any:
         rng = random_stream(self._seed(), TRAINING_STREAM, self.epoch, index)
-        return self.problem.generator(self.training_env.num_envs, rng)
+        assert isinstance(self.model.policy, AllocatorPolicy)
+        return self.model.policy.arrange(training_batch(self.problem.generator, self.training_env.num_envs, rng))
 
     def _seed(self) -> int:
         return getattr(self.model, "stream_seed", None) or self.model.seed or 0
@@ -468,33 +504,38 @@ class ITSCallback(BaseCallback):
         :param others: More callbacks
         :return: How many instances it learned from
         """
-        assert self.instances_per_epoch is not None
+        n_instances = self._router_epoch_size()
         callback = CallbackList([statistics, *others])
         if isinstance(self.router, REINFORCE):
             before = self.router.n_instances
             # Up to a multiple of the epoch's size, so that whole batches do not add up to more epochs than there are.
-            self.router.learn_instances(number * self.instances_per_epoch - before, callback)
+            self.router.learn_instances(number * n_instances - before, callback)
             return self.router.n_instances - before
         # SB3 keeps the last observation of the previous generator's instances otherwise.
         self.router._last_obs = None
         # Whole rollouts, because SB3 throws away one that a callback stops.
         steps = self.router.n_steps * self.router.n_envs
-        while statistics.n_episodes < self.instances_per_epoch:
+        while statistics.n_episodes < n_instances:
             self.router.learn(steps, callback, reset_num_timesteps=False)
         return statistics.n_episodes
+
+    def _router_epoch_size(self) -> int:
+        size = self.router_instances_per_epoch or self.instances_per_epoch
+        assert size is not None
+        return size
 
     def _progress(self, description: str) -> tuple[list[BaseCallback], Any]:
         """A callback that reports on the run's progress bar, if there is one, and what to call afterwards."""
         bars = self._siblings(ProgressBarCallback)
         if not bars:
             return [], lambda: None
-        assert self.instances_per_epoch is not None
+        n_instances = self._router_epoch_size()
         if getattr(bars[0], "pbar", None) is None:
             # Pre-training: the allocator's bar does not exist yet.
-            bar = tqdm(total=self.instances_per_epoch, desc=description)
-            return [OwnProgress(description, bar, self.instances_per_epoch)], bar.close
+            bar = tqdm(total=n_instances, desc=description)
+            return [OwnProgress(description, bar, n_instances)], bar.close
         bar = bars[0].pbar
-        return [RouterProgress(description, bar, self.instances_per_epoch)], lambda: bar.set_description("allocator")
+        return [RouterProgress(description, bar, n_instances)], lambda: bar.set_description("allocator")
 
     # ------------------------------------------------------------------------------------------------------ files
 
@@ -610,6 +651,20 @@ def read_state(folder: Path) -> dict[str, Any]:
     if missing:
         raise ValueError(f"{path}: fields {sorted(missing)} are missing; resume from another checkpoint.")
     return state
+
+
+def resolve_path(path: str, what: str) -> Any:
+    """
+    :param path: ``package.module.name``
+    :param what: What has this path, named in errors
+    :return: The object
+    :raises ValueError: If there is none
+    """
+    module_name, _, name = path.rpartition(".")
+    try:
+        return getattr(import_module(module_name), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{what} is {path!r}, which cannot be imported ({error}); give its dotted path.") from error
 
 
 def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.instances import InstanceGenerator, Instances
+from sb3_uav.envs.instances import InstanceGenerator, Instances, MixtureGenerator, training_batch
 from sb3_uav.policies import AllocatorPolicy
 
 # How many instances of a test are allocated at once: the smaller of the paper's batches.
@@ -32,6 +32,10 @@ class WholeInstances:
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         return replace(self.generator(batch_size, rng), n_uavs=1)
+
+    def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """The same of the instances that the generator prefers to train on."""
+        return replace(training_batch(self.generator, batch_size, rng), n_uavs=1)
 
 
 class AllocatedSubsets:
@@ -89,6 +93,24 @@ class AllocatedSubsets:
         self.seconds += time.perf_counter() - start
         return drawn
 
+    def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        Where the generator mixes sizes, subsets of one batch chosen at random, so that small subsets are not padded to large
+        ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets. As every update draws its batch
+        anew, :attr:`fraction` does not apply to them.
+        """
+        if not isinstance(self.generator, MixtureGenerator):
+            return self(batch_size, rng)
+        start = time.perf_counter()
+        own_rng = self.stream(self._n_chunks)
+        self._n_chunks += 1
+        subsets = self._allocate(self.draw_batch(self.batches[int(own_rng.integers(len(self.batches)))]), own_rng)
+        n_rows = max(round(batch_size * self.generator.min_tasks / subsets.n_tasks), 2)
+        drawn = subsets[own_rng.permutation(len(subsets))[:n_rows]]
+        drawn = drawn.trim(max(int(drawn.task_mask.sum(1).max()), 1))
+        self.seconds += time.perf_counter() - start
+        return drawn
+
     def _next_chunk(self) -> Instances:
         rng = self.stream(self._n_chunks)
         self._n_chunks += 1
@@ -114,7 +136,7 @@ class AllocatedSubsets:
         :param batch_size: Number of subsets
         :param rng: The source of randomness
         """
-        instances = self.generator(-(-batch_size // self.generator.n_uavs), rng)
+        instances = self.allocator.arrange(self.generator(-(-batch_size // self.generator.n_uavs), rng))
         rows = th.arange(len(instances)).split(HELD_OUT_ROWS)
         subsets = Instances.concatenate([self._allocate(instances[part], rng) for part in rows])
         return subsets[rng.permutation(len(subsets))[:batch_size]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,10 +47,10 @@ def _enjoy(arguments: list[str]) -> int:
     parser.add_argument("--load-last-checkpoint", action="store_true")
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
-    router = None
+    router, model = None, None
     if not known.help:
         which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
-        _, _, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
+        _, model, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
         router = find_router(Path(run_folder), known.load_best)
         if router is not None and (known.load_checkpoint is not None or known.load_last_checkpoint):
             print("Checkpoints of the zoo hold no router: rewards come from the run's last one.")
@@ -57,7 +58,7 @@ def _enjoy(arguments: list[str]) -> int:
     with (
         # A plain function would become a method of the class that it is set on.
         patch.object(ExperimentManager, "default_vec_env_cls", staticmethod(make_batched_vec_env)),
-        patch.object(rl_zoo3.enjoy, "create_test_env", partial(_create_test_env, create_test_env, router)),
+        patch.object(rl_zoo3.enjoy, "create_test_env", partial(_create_test_env, create_test_env, model, router)),
         patch.object(sys, "argv", ["sb3_uav.zoo.enjoy", "--algo", known.algo, "-f", known.folder, *arguments]),
     ):
         rl_zoo3.enjoy.enjoy()
@@ -74,12 +75,16 @@ def find_router(run_folder: Path, best: bool) -> Path | None:
     return next((run_folder / name for name in names if (run_folder / name).is_file()), None)
 
 
-def _create_test_env(create_test_env: Any, router: Path | None, env_id: str, **kwargs: Any) -> Any:
-    """``rl_zoo3.utils.create_test_env``, and hand the router to the environment."""
-    from sb3_uav.policies import RouterPolicy
+def _create_test_env(create_test_env: Any, model: str | None, router: Path | None, env_id: str, **kwargs: Any) -> Any:
+    """``rl_zoo3.utils.create_test_env``, handing the router and the allocator's order of tasks to the environment."""
+    from sb3_uav.policies import AllocatorPolicy, RouterPolicy
     from sb3_uav.policies.loading import load_policy
 
     env = create_test_env(env_id, **kwargs)
+    if model is not None and env.has_attr("set_task_order"):
+        # A stock policy has no order of its own.
+        with suppress(ValueError):
+            env.env_method("set_task_order", load_policy(model, "cpu", AllocatorPolicy).env_order)
     if router is not None and env.has_attr("set_router"):
         env.env_method("set_router", load_policy(router, expected=RouterPolicy).plan)
         print(f"Rewards come from the router {router}")

@@ -1,0 +1,53 @@
+"""The benchmark of both levels' training: what it measures, not how fast it is."""
+
+import csv
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "training_throughput.py"
+TINY = ["--n-tasks", "5", "--n-uavs", "2", "--batch-size", "4", "--epoch-batches", "1", "--seconds", "0.01", "--rounds", "2"]
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    specification = importlib.util.spec_from_file_location("training_throughput", SCRIPT)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_competitors_and_episodes(benchmark, tmp_path, capsys):
+    """Without RL4CO: ours in three ways, of which only the shipped one takes 8 samples of an instance."""
+    benchmark.main([*TINY, "--out", str(tmp_path / "out.csv")])
+    rows = list(csv.DictReader((tmp_path / "out.csv").open()))
+    samples = {
+        (row["level"], row["competitor"], int(row["round"])): int(row["n_episodes"]) / int(row["n_instances"]) for row in rows
+    }
+    runs = [("allocator", "default"), ("allocator", "paper"), ("router", "default"), ("router", "paper"), ("router", "plain")]
+    assert samples == {(*run, number): 8 if run[1] == "default" else 1 for run in runs for number in (1, 2)}
+    assert all(int(row["n_instances"]) % 4 == 0 and float(row["seconds"]) >= 0.01 for row in rows)
+    printed = capsys.readouterr().out
+    assert printed.count("default / paper") == 2 and "rl4co-default" not in printed
+
+
+def test_settings(benchmark):
+    """The paper's way rolls its baseline out from the first instance on; the attention models differ in their shape only."""
+    paper, plain = benchmark.settings_of("paper")["router"], benchmark.settings_of("plain")["router"]
+    assert (paper["baseline"], paper["baseline_kwargs"], paper.get("n_samples", 1)) == ("rollout", {"warmup_epochs": 0}, 1)
+    assert {**plain, "policy_kwargs": None} == {**paper, "policy_kwargs": None}
+    expected = dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch")
+    assert benchmark.router_shape("paper") == expected
+    assert plain["policy_kwargs"] == {"preset": "paper", **benchmark.router_shape("default")}
+
+
+def test_a_failing_rl4co_is_reported(benchmark, tmp_path):
+    """Any Python that cannot import RL4CO."""
+    broken = tmp_path / "python"
+    broken.write_text(f"#!{sys.executable}\nraise SystemExit(3)\n")
+    broken.chmod(0o755)
+    with pytest.raises(RuntimeError, match=r"--serve.* ended with 3; see"):
+        benchmark.main([*TINY, "--level", "router", "--rl4co", str(broken)])

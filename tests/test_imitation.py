@@ -1,0 +1,142 @@
+"""Imitation of local search: a router that has only been shown tours beats an untrained one, and starts an ITS run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from test_solvers import make_policy
+
+from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv, UniformGenerator, check_schedule, nearest_feasible, schedules
+from sb3_uav.envs.allocation import plan_tours
+from sb3_uav.envs.instances import MixtureGenerator
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training import ITSCallback
+from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+
+pytest.importorskip("numba")
+from sb3_uav.solvers.imitation import Lesson, good_tours, imitate, search_lessons, varied
+
+WARM_START = {"sb3_uav.solvers.imitation.imitate": {"n_subsets": 40, "n_updates": 4, "batch_size": 8}}
+
+
+@pytest.fixture(scope="module")
+def allocator() -> Any:
+    return make_policy(AllocatorPolicy, 4)
+
+
+def parameters(policy: Any) -> th.Tensor:
+    return th.cat([parameter.flatten() for parameter in policy.parameters()]).detach().clone()
+
+
+def test_tours_are_feasible_and_good() -> None:
+    """At least as good as the nearest feasible task after another, and complete: nothing more can be visited."""
+    subsets = UniformGenerator(25, 1, max_distance=1.5)(6, np.random.default_rng(0)).pad(30)
+    tours = good_tours(subsets)
+    for row, schedule in enumerate(schedules(tours[:, None] - 1)):
+        assert check_schedule(subsets, row, schedule).objective == int((tours[row] > 0).sum())
+    evaluation = make_policy(RouterPolicy).evaluate_episodes(subsets, tours[:, None])
+    assert evaluation.log_prob.isfinite().all()
+    assert (tours > 0).sum() > (nearest_feasible(subsets) > 0).sum()
+
+
+def test_a_router_learns_by_imitation(allocator: Any) -> None:
+    """Greedy tours over new instances. Without geometry it knows nothing at first."""
+    router = make_policy(RouterPolicy, geometry=False)
+    instances = allocator.arrange(UniformGenerator(60, 4)(24, np.random.default_rng(7)))
+    assignment = allocator.decode_episodes(instances)
+
+    def tasks() -> float:
+        return float(plan_tours(instances, assignment, router.plan).value.mean())
+
+    before = tasks()
+    imitate(router, allocator, UniformGenerator(60, 4), np.random.default_rng(0), 800, 150, 32, 5e-3)
+    assert not router.training
+    assert tasks() > 1.15 * before
+
+
+def test_the_same_numbers_give_the_same_router(allocator: Any) -> None:
+    found = []
+    for _ in range(2):
+        router = make_policy(RouterPolicy)
+        imitate(router, allocator, MixtureGenerator(50, 4), np.random.default_rng(3), 40, 3, 8)
+        found.append(parameters(router))
+    assert th.equal(*found) and not th.equal(found[0], parameters(make_policy(RouterPolicy)))
+
+
+def test_variants_are_the_same_tours(allocator: Any) -> None:
+    """Some of the rows, turned, some of them backwards: as long, and as many tasks."""
+    lesson = search_lessons(allocator, UniformGenerator(30, 4), np.random.default_rng(0), 60, 16)[0]
+    for seed in range(4):
+        variant = varied(lesson, np.random.default_rng(seed), 16)
+        assert 0 < len(variant.tours) <= len(lesson.tours)
+        for row in range(len(variant.tours)):
+            length = tour_length(variant, row)
+            assert any(length == pytest.approx(tour_length(lesson, other), abs=1e-6) for other in range(len(lesson.tours)))
+
+
+def tour_length(lesson: Lesson, row: int) -> float:
+    tour = [node for node in lesson.tours[row].tolist() if node > 0]
+    stops = th.stack([lesson.instances.depot[row], *(lesson.instances.tasks[row, node - 1] for node in tour)])
+    return float((stops - stops.roll(-1, 0)).norm(dim=1).sum())
+
+
+def test_lessons_report_and_count(allocator: Any) -> None:
+    told: list[str] = []
+    imitate(
+        make_policy(RouterPolicy), allocator, UniformGenerator(20, 4), np.random.default_rng(0), 20, 2, 8, report=told.append
+    )
+    assert told[-1].startswith("imitation: 2 of 2 updates")
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(n_subsets=0), "n_subsets is 0; it must be a whole number of at least 1"),
+        (dict(n_updates=1.5), "n_updates is 1.5; it must be a whole number"),
+        (dict(learning_rate=0.0), "learning_rate is 0.0; it must be above 0"),
+    ],
+)
+def test_wrong_arguments(kwargs: Any, message: str, allocator: Any) -> None:
+    with pytest.raises(ValueError, match=message):
+        imitate(make_policy(RouterPolicy), allocator, UniformGenerator(5, 4), np.random.default_rng(0), **kwargs)
+
+
+def make_its(**kwargs: Any) -> ITSCallback:
+    router = dict(policy="RouterPolicy", n_envs=2, policy_kwargs=dict(embed_dim=8, n_layers=1, n_heads=2), baseline="none")
+    settings: dict[str, Any] = dict(n_epochs=1, strategy="ITS/pre-training&intensive", warm_start=WARM_START)
+    return ITSCallback(router, **{**settings, **kwargs})
+
+
+def make_model() -> REINFORCE:
+    policy: Any = AllocatorPolicy
+    env: Any = BatchedVecEnv([lambda: TaskAllocationEnv(8, 2)] * 2)
+    return REINFORCE(policy, env, instances_per_epoch=2, baseline="none", seed=0, device="cpu")
+
+
+def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """The router has learned before the allocator begins; a run that goes on does not begin anew."""
+    make_model().learn(10**9, callback=make_its(save_path=str(tmp_path), verbose=1))
+    assert "imitation: 4 of 4 updates" in capsys.readouterr().out
+    state = read_state(tmp_path / CHECKPOINT_FOLDER)
+    model = REINFORCE.load(tmp_path / CHECKPOINT_FOLDER / state["allocator"], env=make_model().env, device="cpu")
+    again = make_its(save_path=str(tmp_path), verbose=1, n_epochs=2)
+    model.learn(10**9, callback=again, reset_num_timesteps=False)
+    assert "imitation" not in capsys.readouterr().out and again.epoch == 2
+
+
+@pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
+@pytest.mark.parametrize(
+    "warm_start, message",
+    [
+        ({}, "warm_start must map the dotted path of one function to its arguments"),
+        ({"sb3_uav.nothing.at_all": {}}, "warm_start is 'sb3_uav.nothing.at_all', which cannot be imported"),
+        ({"sb3_uav.solvers.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),
+    ],
+)
+def test_wrong_warm_starts(warm_start: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model().learn(10**9, callback=make_its(warm_start=warm_start))

@@ -1,0 +1,167 @@
+"""Repair and polish behind the networks: never worse, within the time, and named as what they are."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from conftest import instance_batches
+from hypothesis import given, settings
+from test_solvers import make_pair, objectives, routes
+
+from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
+from sb3_uav.solvers import make_solver
+from sb3_uav.solvers.dl_drl import Block, Shortlists
+from sb3_uav.solvers.evaluation import evaluate
+from sb3_uav.solvers.refinement import Refinement, polish
+
+pytest.importorskip("numba")
+
+
+@pytest.fixture(scope="module")
+def instances() -> Instances:
+    return UniformGenerator(30, n_uavs=3)(4, np.random.default_rng(5))
+
+
+@settings(max_examples=15)
+@given(instance_batches())
+def test_refined_schedules_of_any_instance_are_feasible_and_not_worse(batch: Instances) -> None:
+    plain = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4), batch)
+    repaired = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, repair=True), batch)
+    polished = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, polish=0.004), batch)
+    assert (repaired >= plain).all() and (polished >= plain).all()
+
+
+def test_repair_and_polish_find_more(instances: Instances) -> None:
+    """Untrained networks leave much to be found, also by repairing several samples instead of one."""
+    plain = objectives(make_pair(decode="sampling", samples=32), instances).sum()
+    repaired = objectives(make_pair(decode="sampling", samples=32, repair=True), instances).sum()
+    assert plain < repaired <= objectives(make_pair(repair=True, polish=0.3), instances).sum()
+
+
+def test_repair_is_repeatable(instances: Instances) -> None:
+    pair = make_pair(decode="augment", samples=32, repair=True)
+    assert routes(pair, instances, 1) == routes(pair, instances, 1)
+
+
+def test_threads_change_nothing(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = make_pair(decode="sampling", samples=16, repair=True)
+    alone = routes(pair, instances)
+    monkeypatch.setattr(th, "get_num_threads", lambda: 3)
+    assert routes(pair, instances) == alone
+
+
+def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a clock that goes on when something is sampled, and a little whenever it is looked at."""
+    pair = make_pair(decode="sampling", samples=64, repair=True, polish=9.0)
+    drawn: list[int] = []
+    spent: list[float] = []
+    sample_block = pair._sample_block
+
+    def counting(*args: Any) -> th.Tensor:
+        block = sample_block(*args)
+        drawn.append(block.shape[1])
+        clock.now += 0.2  # type: ignore[attr-defined]
+        return block
+
+    def clock() -> float:
+        clock.now += 1e-4  # type: ignore[attr-defined]
+        return clock.now  # type: ignore[attr-defined]
+
+    def noting(instance: Instances, schedule: Schedule, seconds: float, seed: int) -> Schedule:
+        spent.append(seconds)
+        return schedule
+
+    clock.now = 0.0  # type: ignore[attr-defined]
+    monkeypatch.setattr(pair, "_sample_block", counting)
+    monkeypatch.setattr("sb3_uav.solvers.refinement.polish", noting)
+    monkeypatch.setattr(time, "perf_counter", clock)
+    pair.solve(instances, time_limit=0.5)
+    some = sum(drawn)
+    assert 0 < some < 64 and len(spent) == len(instances)
+    # Two seconds for the four of them, less what the networks and the repair took.
+    assert 0 < sum(spent) < 2.0
+    drawn.clear()
+    pair.solve(instances, time_limit=50.0)
+    assert sum(drawn) == 64 and max(spent) == 9.0
+
+
+def test_plain_networks_need_no_time_limit(instances: Instances) -> None:
+    plain, limited = make_pair(decode="sampling", samples=8), make_pair(decode="sampling", samples=8, time_limit=30.0)
+    assert not plain.uses_time_limit and limited.uses_time_limit
+    assert make_pair(repair=True).uses_time_limit and make_pair(polish=0.1).uses_time_limit
+    assert (objectives(limited, instances) >= objectives(make_pair(), instances)).all()
+    with pytest.raises(ValueError, match=r"time_limit of .* is 0 seconds"):
+        limited.solve(instances, time_limit=0.0)
+
+
+def test_names_say_what_was_done(instances: Instances, tmp_path: Any) -> None:
+    """Refined schedules stand in rows of their own."""
+    solvers = [make_pair(), make_pair(repair=True), make_pair(decode="augment", samples=16, repair=True, polish=0.01)]
+    names = ["DL-DRL (greedy)", "DL-DRL (greedy + repair)", "DL-DRL (augment 16 + repair + polish 0.01 s)"]
+    assert [solver.name for solver in solvers] == names
+    assert [row.solver for row in evaluate(solvers, instances[:2], tmp_path)] == names
+    assert len({str(solver.settings()) for solver in solvers}) == 3
+
+
+@pytest.mark.parametrize("seconds", [-1.0, math.inf, math.nan])
+def test_wrong_polish(seconds: float) -> None:
+    with pytest.raises(ValueError, match=f"polish is {seconds:g}; give a number of seconds"):
+        Refinement(polish=seconds)
+
+
+def test_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert not Refinement().is_wanted
+    with pytest.raises(ImportError, match=r"pip install 'sb3-uav\[solvers\]'"):
+        Refinement(repair=True)
+
+
+def test_polish_without_pyvrp(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ruin and recreate alone."""
+    monkeypatch.setitem(sys.modules, "pyvrp", None)
+    assert check_schedule(instances, 0, polish(instances[0], Schedule([]), 0.05)).objective > 0
+
+
+def test_shortlists_keep_the_best_and_the_first_of_equal_ones() -> None:
+    lists = Shortlists(1, 2)
+    tours = th.tensor([[[[0, -1]], [[1, -1]], [[1, -1]], [[2, 3]]]])
+    lists.add(Block(th.tensor([[1.0, 1.0, 1.0, 2.0]]), tours))
+    first = [schedule.routes for schedule in lists.schedules()[0]]
+    assert first == [((2, 3),), ((0,),)]
+    lists.add(Block(th.tensor([[1.0, 0.5]]), th.tensor([[[[4]], [[5]]]])))
+    assert [schedule.routes for schedule in lists.schedules()[0]] == first
+    lists.add(Block(th.tensor([[3.0]]), th.tensor([[[[6]]]])))
+    assert [schedule.routes for schedule in lists.schedules()[0]] == [((6,),), ((2, 3),)]
+
+
+def test_options_of_the_command_line(instances: Instances) -> None:
+    """``repair=1`` as well as ``repair=true``, and the pair that comes with the package."""
+    assert make_solver("dl-drl:repair=1,polish=0.5").settings() == make_solver("dl-drl:repair=true,polish=0.5").settings()
+    assert make_solver("dl-drl:repair=0").settings() == make_solver("dl-drl").settings()
+    assert objectives(make_solver("dl-drl"), instances).min() > 0
+
+
+def test_shortlists_hold_different_schedules() -> None:
+    lists = Shortlists(1, 3)
+    copies = th.zeros(1, 9, 1, 1, dtype=th.int64)
+    lists.add(Block(th.full((1, 10), 2.0), th.cat([copies, copies[:, :1] + 1], dim=1)))
+    assert [schedule.routes for schedule in lists.schedules()[0]] == [((0,),), ((1,),)]
+
+
+def test_every_instance_has_its_share_of_the_time(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    given_seconds: list[float] = []
+
+    def noting(instance: Instances, candidates: Any, seconds: float) -> Schedule:
+        given_seconds.append(seconds)
+        return candidates[0]
+
+    monkeypatch.setattr("sb3_uav.solvers.local_search.repair_best", noting)
+    refinement = Refinement(repair=True)
+    refinement(instances, [[Schedule([])]] * len(instances), time.perf_counter() + 8.0)
+    assert len(given_seconds) == 4 and all(1.5 < seconds <= 2.0 for seconds in given_seconds)
