@@ -24,7 +24,7 @@ class Timed(Solver):
     name = "timed"
 
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
-        raise NotImplementedError
+        return [result for _, result in self.solve_rows(instances, range(len(instances)), time_limit, seed)]
 
     def solve_rows(self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0) -> Any:
         assert time_limit is not None

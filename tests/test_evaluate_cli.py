@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 import types
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,14 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from test_evaluation import Stub
 
 import sb3_uav
 from sb3_uav.envs import BatchedVecEnv, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.solvers import SOLVERS, Solver, SolverResult
+from sb3_uav.solvers import SOLVERS, SolverResult
 from sb3_uav.solvers.limits import deadline_after
 from sb3_uav.solvers.results import RESULT_COLUMNS, file_hash
 from sb3_uav.zoo import cli
@@ -83,18 +83,6 @@ def user_error(capsys: pytest.CaptureFixture[str], *arguments: Any) -> str:
     lines = [line for line in captured.err.splitlines() if line.startswith("sb3-uav: error: ")]
     assert len(lines) == 1 and "Traceback" not in captured.err and captured.out == ""
     return lines[0]
-
-
-class Stub(Solver):
-    """Returns the given routes for every instance."""
-
-    name = "stub"
-
-    def __init__(self, routes: Sequence[Sequence[int]] = ()) -> None:
-        self.routes = routes
-
-    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
-        return [SolverResult(Schedule(self.routes), 0.5, len(instances)) for _ in range(len(instances))]
 
 
 class Interrupted(Stub):
