@@ -17,7 +17,7 @@ from torch import nn
 from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
 from sb3_uav.policies import AllocatorExtractor, AllocatorPolicy, EpisodicPolicy, RouterExtractor, RouterPolicy
 from sb3_uav.policies.base import sample_actions
-from sb3_uav.policies.encoder import AttentionEncoder, NodeNorm, StaticObservation
+from sb3_uav.policies.encoder import AttentionEncoder, NodeNorm, SelfAttention, StaticObservation
 
 SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=2, n_heads=4, ff_dim=32)
 # Leaves the sizes to the preset.
@@ -512,6 +512,7 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         use_values=True,
         relative=True,
         geometry=True,
+        bias_dim=9,
         shared_scorer=False,
         sweep=True,
         mixed_precision=True,
@@ -539,6 +540,32 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         assert (len(encoder.layers), encoder.layers[0].attention.n_heads, encoder.use_values) == (1, 3, True)
     for name, value in policy.state_dict().items():
         assert th.equal(value, loaded.state_dict()[name])
+
+
+def test_relative_attention_knows_exact_positions_in_mixed_precision():
+    """In bfloat16 these positions would be one and the same."""
+    th.manual_seed(0)
+    attention = SelfAttention(8, 2, relative=True)
+    with th.no_grad():
+        attention.project_in.weight[:16] = 0.0
+        attention.log_locality.fill_(math.log(3e7))
+    nodes, coordinates = th.randn(1, 5, 8), 0.3 + 4e-4 * th.arange(5.0)[None, :, None].expand(1, 5, 2)
+    exact = attention(nodes, None, coordinates)
+    with th.autocast("cpu", th.bfloat16):
+        mixed = attention(nodes, None, coordinates)
+    # Every node looks at itself alone, so that the five results differ as much as the nodes do.
+    assert (exact - attention.project_out(attention.project_in(nodes)[..., 16:])).abs().max() < 0.05
+    assert (mixed - exact).abs().max() < 0.05 < exact.std(dim=1).min()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_mixed_precision_changes_little(level):
+    policy, instances = make_policy(level), draw(4, n_uavs=1 if level == "router" else 3)
+    plain = policy.encode(instances).nodes
+    policy.features_extractor.encoder.mixed_precision = True
+    mixed = policy.encode(instances).nodes
+    assert not th.equal(plain, mixed)
+    assert (plain - mixed).abs().max() < 0.1
 
 
 @pytest.mark.parametrize("level", LEVELS)

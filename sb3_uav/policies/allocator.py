@@ -96,7 +96,7 @@ class AllocatorExtractor(EpisodicExtractor):
 
     environment = "TaskAllocation"
     own_key = "assignment"
-    foreign_settings = frozenset({"sweep"})
+    foreign_settings = frozenset({"sweep", "bias_dim"})
 
     def __init__(
         self,

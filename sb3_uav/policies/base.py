@@ -40,6 +40,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         use_values=True,
         relative=True,
         geometry=True,
+        bias_dim=32,
         shared_scorer=True,
         sweep=True,
         mixed_precision=False,
@@ -54,6 +55,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         use_values=False,
         relative=False,
         geometry=False,
+        bias_dim=32,
         shared_scorer=False,
         sweep=False,
         mixed_precision=False,
@@ -284,7 +286,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param action_space: Of the same environment
     :param lr_schedule: Learning rate schedule (could be constant)
     :param preset: ``"default"``, or ``"paper"`` for the network of the paper
-    :param embed_dim: Size of the embeddings; the preset's when None, like the next ten
+    :param embed_dim: Size of the embeddings; the preset's when None, like the next eleven
     :param n_layers: Number of attention layers
     :param n_heads: Number of heads
     :param ff_dim: Hidden size of the feed-forward sublayers
@@ -292,6 +294,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param use_values: Whether task values are features of the encoder
     :param relative: Whether networks see coordinates relative to the depot in units of the maximum flight distance
     :param geometry: Whether decoders are told distances, slack and loads (the allocator needs ``shared_scorer`` for that)
+    :param bias_dim: Hidden size of what the router makes of them
     :param shared_scorer: Whether one scorer judges all UAVs of the allocator, so that it serves fleets of any size
     :param sweep: Whether the allocator wants the tasks in the order of :func:`~sb3_uav.envs.sweep.sweep_order`
     :param mixed_precision: Whether encoders compute in bfloat16 where that is safe
@@ -320,6 +323,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         use_values: bool | None = None,
         relative: bool | None = None,
         geometry: bool | None = None,
+        bias_dim: int | None = None,
         shared_scorer: bool | None = None,
         sweep: bool | None = None,
         mixed_precision: bool | None = None,
@@ -343,6 +347,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
             use_values=use_values,
             relative=relative,
             geometry=geometry,
+            bias_dim=bias_dim,
             shared_scorer=shared_scorer,
             sweep=sweep,
             mixed_precision=mixed_precision,

@@ -178,18 +178,39 @@ class SelfAttention(nn.Module):
             return self.project_out(attend(query, key, value, self.n_heads, attention_bias))
         # -slope * |a - b|^2 is, but for a term in a alone that softmax ignores, the product of (2 a, -1) and (b, |b|^2): four
         # more columns of queries and keys, so that the fused kernel can go on without a matrix of scores.
-        query, key, value = (part.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for part in (query, key, value))
+        query, key, value = (part.unflatten(-1, (self.n_heads, -1)).transpose(1, 2).float() for part in (query, key, value))
         head_dim = query.shape[-1]
-        slope = self.log_locality.exp()[:, None, None].to(query.dtype)
-        places = coordinates[:, None].to(query.dtype)
+        slope = self.log_locality.exp()[:, None, None]
+        places = coordinates[:, None]
         shape = (*query.shape[:3], -1)
         minus_one, zero = -th.ones_like(places[..., :1]), th.zeros_like(places[..., :1])
         query = th.cat([query / math.sqrt(head_dim), slope * th.cat([2 * places, minus_one, zero], dim=-1)], dim=-1)
         squares = (places**2).sum(-1, keepdim=True)
         key = th.cat([key, th.cat([places, squares, zero], dim=-1).expand(shape)], dim=-1)
         value = functional.pad(value, (0, 4))
-        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=attention_bias, scale=1.0)
+        mixed = fused_attention(query, key, value, attention_bias, 1.0)
         return self.project_out(mixed[..., :head_dim].transpose(1, 2).flatten(2))
+
+
+def fused_attention(
+    query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor | None, scale: float | None = None
+) -> th.Tensor:
+    """
+    Torch's fused kernel, always in float32, autocast or not.
+
+    With such small heads bfloat16 saves nothing on a CPU, its backward pass takes three to six times as long
+    (``benchmarks/attention.py``), and it would round the positions that relative attention is told.
+
+    :param query: ``(batch, n_heads, n_queries, head_dim)``
+    :param key: ``(batch, n_heads, n_nodes, head_dim)``
+    :param value: ``(batch, n_heads, n_nodes, head_dim)``
+    :param attention_bias: Added to the scores, or None
+    :param scale: Of the scores; one over the root of ``head_dim`` when None
+    :return: ``(batch, n_heads, n_queries, head_dim)``
+    """
+    with th.autocast(query.device.type, enabled=False):
+        query, key, value = query.float(), key.float(), value.float()
+        return functional.scaled_dot_product_attention(query, key, value, attn_mask=attention_bias, scale=scale)
 
 
 def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, attention_bias: th.Tensor | None) -> th.Tensor:
@@ -207,7 +228,7 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     :return: ``(batch, n_queries, embed_dim)``
     """
     query, key, value = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
-    return functional.scaled_dot_product_attention(query, key, value, attn_mask=attention_bias).transpose(1, 2).flatten(2)
+    return fused_attention(query, key, value, attention_bias).transpose(1, 2).flatten(2)
 
 
 class AttentionLayer(nn.Module):
@@ -299,8 +320,7 @@ class AttentionEncoder(nn.Module):
         node_mask, attention_bias = None, None
         if not static.task_mask.all():
             node_mask = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)
-            dtype = th.bfloat16 if self.mixed_precision else nodes.dtype
-            attention_bias = th.zeros_like(node_mask, dtype=dtype).masked_fill(~node_mask, -th.inf)[:, None, None]
+            attention_bias = th.zeros_like(node_mask, dtype=th.float32).masked_fill(~node_mask, -th.inf)[:, None, None]
         # Sums and norms stay in float32.
         with th.autocast(nodes.device.type, th.bfloat16, enabled=self.mixed_precision):
             for layer in self.layers:

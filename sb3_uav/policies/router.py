@@ -19,8 +19,8 @@ from sb3_uav.policies.geometry import N_MOVE_FEATURES, MoveGeometry
 
 # Logits are clipped to +-10 (paper, equation of u; Bello et al.).
 LOGIT_CLIP = 10.0
-# Hidden size of the geometric bias, and how steeply it prefers near tasks before training.
-BIAS_DIM, NEAREST_FIRST = 32, 4.0
+# How steeply the geometric bias prefers near tasks before training.
+NEAREST_FIRST = 4.0
 # Into how many chunks by size subsets are cut before they are padded.
 SIZE_CLASSES = 2
 
@@ -44,16 +44,17 @@ class MoveBias(nn.Module):
     It starts as a preference for near tasks: twice as far away is ``2**NEAREST_FIRST`` times less likely.
 
     :param embed_dim: Size of the embeddings
+    :param bias_dim: Hidden size
     :param n_scores: How many scores a move has
     """
 
-    def __init__(self, embed_dim: int, n_scores: int) -> None:
+    def __init__(self, embed_dim: int, bias_dim: int, n_scores: int) -> None:
         super().__init__()
         self.linear = nn.Linear(N_MOVE_FEATURES, n_scores)
-        self.project_features = nn.Linear(N_MOVE_FEATURES, BIAS_DIM)
-        self.project_node = nn.Linear(embed_dim, BIAS_DIM, bias=False)
-        self.project_query = nn.Linear(embed_dim, BIAS_DIM, bias=False)
-        self.score = nn.Linear(BIAS_DIM, n_scores)
+        self.project_features = nn.Linear(N_MOVE_FEATURES, bias_dim)
+        self.project_node = nn.Linear(embed_dim, bias_dim, bias=False)
+        self.project_query = nn.Linear(embed_dim, bias_dim, bias=False)
+        self.score = nn.Linear(bias_dim, n_scores)
         for parameter in (*self.linear.parameters(), *self.score.parameters()):
             nn.init.zeros_(parameter)
         with th.no_grad():
@@ -62,7 +63,7 @@ class MoveBias(nn.Module):
     def forward(self, features: th.Tensor, nodes: th.Tensor, query: th.Tensor) -> th.Tensor:
         """
         :param features: ``(batch, n_samples, n_nodes, N_MOVE_FEATURES)``
-        :param nodes: ``(batch, n_nodes, BIAS_DIM)``, the projected nodes
+        :param nodes: ``(batch, n_nodes, bias_dim)``, the projected nodes
         :param query: ``(batch, n_samples, embed_dim)``, where the UAV is and what it can still fly
         :return: ``(batch, n_samples, n_nodes, n_scores)``
         """
@@ -85,6 +86,7 @@ class RouterExtractor(EpisodicExtractor):
     :param use_values: Whether task values are features of the encoder
     :param relative: Whether the encoder sees scaled coordinates relative to the depot
     :param geometry: Whether distances and slack add a learned bias to the scores of the glimpse and to the compatibilities
+    :param bias_dim: Hidden size of what computes that bias
     :param mixed_precision: Whether the encoder computes in bfloat16
     """
 
@@ -103,6 +105,7 @@ class RouterExtractor(EpisodicExtractor):
         use_values: bool = True,
         relative: bool = False,
         geometry: bool = False,
+        bias_dim: int = 32,
         mixed_precision: bool = False,
     ) -> None:
         super().__init__(
@@ -124,7 +127,7 @@ class RouterExtractor(EpisodicExtractor):
         self.project_nodes = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_glimpse = nn.Linear(embed_dim, embed_dim, bias=False)
         self.scaled = relative or geometry
-        self.move_bias = MoveBias(embed_dim, n_heads + 1) if geometry else None
+        self.move_bias = MoveBias(embed_dim, bias_dim, n_heads + 1) if geometry else None
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
         real = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)[..., None]
