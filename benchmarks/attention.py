@@ -25,9 +25,9 @@ def written_out(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int
 
 def in_bfloat16(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, bias: th.Tensor | None) -> th.Tensor:
     """The kernel as autocast would call it."""
-    halves = (part.bfloat16().unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
+    query, key, value = (part.bfloat16().unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
     mask = None if bias is None else bias.bfloat16()
-    return th.nn.functional.scaled_dot_product_attention(*halves, attn_mask=mask).transpose(1, 2).flatten(2)
+    return th.nn.functional.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(2)
 
 
 def seconds(attention: Any, inputs: list[th.Tensor], n_heads: int, bias: th.Tensor | None, repeats: int) -> float:

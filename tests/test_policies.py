@@ -3,7 +3,7 @@
 import inspect
 import math
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -543,19 +543,19 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
 
 
 def test_relative_attention_knows_exact_positions_in_mixed_precision():
-    """In bfloat16 these positions would be one and the same."""
+    """In bfloat16 some of these positions would be the same."""
     th.manual_seed(0)
     attention = SelfAttention(8, 2, relative=True)
     with th.no_grad():
         attention.project_in.weight[:16] = 0.0
-        attention.log_locality.fill_(math.log(3e7))
-    nodes, coordinates = th.randn(1, 5, 8), 0.3 + 4e-4 * th.arange(5.0)[None, :, None].expand(1, 5, 2)
+        cast(th.Tensor, attention.log_locality).fill_(math.log(1e7))
+    nodes, coordinates = th.randn(1, 5, 8), 0.3 + 9e-4 * th.arange(5.0)[None, :, None].expand(1, 5, 2)
     exact = attention(nodes, None, coordinates)
     with th.autocast("cpu", th.bfloat16):
         mixed = attention(nodes, None, coordinates)
     # Every node looks at itself alone, so that the five results differ as much as the nodes do.
     assert (exact - attention.project_out(attention.project_in(nodes)[..., 16:])).abs().max() < 0.05
-    assert (mixed - exact).abs().max() < 0.05 < exact.std(dim=1).min()
+    assert (mixed - exact).abs().max() < 0.02 < exact.std(dim=1).min()
 
 
 @pytest.mark.parametrize("level", LEVELS)
