@@ -21,7 +21,7 @@ SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 SIZES = [[2, 9, 4], [3, 12, 2]]
 
 
-def train(folder: Path, freq: int = 2) -> tuple[SizeGridCallback, Any]:
+def train(folder: Path, freq: int = 2, n_samples: int | None = None) -> tuple[SizeGridCallback, Any]:
     env = BatchedVecEnv([lambda: TaskAllocationEnv(8, 2)] * 4)
     kwargs: dict[str, Any] = dict(learning_rate=1e-2, instances_per_epoch=8, seed=0, device="cpu", policy_kwargs=SMALL)
     model = REINFORCE(AllocatorPolicy, env, **kwargs)
@@ -31,7 +31,7 @@ def train(folder: Path, freq: int = 2) -> tuple[SizeGridCallback, Any]:
         n_pretraining_epochs=1,
         save_path=str(folder),
     )
-    fixed = SizeGridCallback(SIZES, max_distance=1.5, freq=freq)
+    fixed = SizeGridCallback(SIZES, max_distance=1.5, freq=freq, n_samples=n_samples)
     model.learn(10**9, callback=[its, fixed])
     return fixed, model
 
@@ -49,6 +49,28 @@ def test_best_pair_is_kept_and_is_as_good_as_recorded(tmp_path: Path) -> None:
         found = np.mean([check_schedule(part, row, result.schedule).objective for row, result in enumerate(results)])
         assert found == pytest.approx(best[name])
     assert best["score"] == pytest.approx(np.mean([np.log(best[name]) for name in fixed.parts]))
+
+
+def test_best_of_several_samples_counts_if_wanted(tmp_path: Path) -> None:
+    one, _ = train(tmp_path / "one", n_samples=1)
+    many, model = train(tmp_path / "many", n_samples=64)
+    greedy, _ = train(tmp_path / "greedy")
+    for name in one.parts:
+        # The same training, whatever is evaluated.
+        assert all(a[name] <= b[name] for a, b in zip(one.records, many.records, strict=True))
+        assert many.records[-1][name] >= greedy.records[-1][name]
+    assert sum(many.records[0].values()) > sum(one.records[0].values())
+    before = dict(many.records[-1])
+    assert many.evaluate() == before["score"]
+    with pytest.raises(ValueError, match="n_samples is 0"):
+        SizeGridCallback(n_samples=0)
+
+
+def test_nowhere_to_keep_the_best_pair_is_said() -> None:
+    env = BatchedVecEnv([lambda: TaskAllocationEnv(8, 2)] * 4)
+    model = REINFORCE(AllocatorPolicy, env, instances_per_epoch=8, seed=0, device="cpu", policy_kwargs=SMALL)
+    with pytest.warns(UserWarning, match="set save_path"):
+        model.learn(64, callback=SizeGridCallback(SIZES))
 
 
 def test_evaluation_does_not_disturb_training(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,7 +30,10 @@ GRID_FILE, BEST_ALLOCATOR_FILE = "size_grid.csv", "best_allocator.zip"
 
 class SizeGridCallback(BaseCallback):
     """
-    Evaluates allocator and router on the same instances again and again, both greedy and with the fused driver.
+    Evaluates allocator and router on the same instances again and again, with the fused driver.
+
+    Both are greedy; with ``n_samples`` the allocator is sampled and the best of the schedules counts, always from the same
+    random numbers. What is best in the one way need not be so in the other.
 
     Writes ``size_grid.csv`` (mean objective by size) and, whenever the geometric mean over the sizes is better than ever,
     ``best_allocator.zip`` and, next to an :class:`~sb3_uav.training.ITSCallback`, ``best_router.zip``.
@@ -37,6 +41,7 @@ class SizeGridCallback(BaseCallback):
     :param sizes: UAVs, tasks and number of instances of each part
     :param max_distance: Maximum flight distance
     :param freq: Updates between evaluations
+    :param n_samples: How many allocations to sample for every instance; the greedy one instead when None
     :param save_path: Folder of the files; that of the ITS when None
     :param verbose: Verbosity level: 0 for no output, 1 for a line per evaluation
     """
@@ -46,13 +51,17 @@ class SizeGridCallback(BaseCallback):
         sizes: Sequence[Sequence[int]] = DEFAULT_SIZES,
         max_distance: float = 2.0,
         freq: int = 100,
+        n_samples: int | None = None,
         save_path: str | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         if freq < 1:
             raise ValueError(f"freq is {freq}; give at least 1 update.")
+        if n_samples is not None and n_samples < 1:
+            raise ValueError(f"n_samples is {n_samples}; give at least 1, or None for greedy allocations.")
         self.freq = freq
+        self.n_samples = n_samples
         self.save_path = None if save_path is None else Path(save_path)
         self.parts = {
             f"U{n_uavs}-N{n_tasks}": UniformGenerator(n_tasks, n_uavs, max_distance)(
@@ -94,6 +103,8 @@ class SizeGridCallback(BaseCallback):
         """Go on with the history, and with the best pair, of a run that is resumed."""
         self._is_restored = True
         folder, its = self._folder(), self._its()
+        if folder is None:
+            warnings.warn("SizeGridCallback keeps no best pair: set save_path to a folder.", stacklevel=3)
         if folder is None or self.model._n_updates == 0:
             return
         earlier = [folder] if its is None or its.resume_from is None else [folder, its.resume_from.parent]
@@ -146,5 +157,7 @@ class SizeGridCallback(BaseCallback):
     def _objective(self, policy: AllocatorPolicy, part: Instances) -> float:
         with th.no_grad():
             arranged = policy.arrange(part).to(policy.device)
-            planned = plan_tours(arranged, policy.decode_episodes(arranged), self.problem.router)
-        return float(planned.value.mean())
+            generator = th.Generator(policy.device).manual_seed(GRID_SEED)
+            actions = policy.decode_episodes(arranged, self.n_samples or 1, self.n_samples is None, generator)
+            planned = plan_tours(arranged, actions, self.problem.router)
+        return float(planned.value.amax(1).mean())
