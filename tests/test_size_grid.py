@@ -53,7 +53,7 @@ def test_best_pair_is_kept_and_is_as_good_as_recorded(tmp_path: Path) -> None:
 
 def test_best_of_several_samples_counts_if_wanted(tmp_path: Path) -> None:
     one, _ = train(tmp_path / "one", n_samples=1)
-    many, model = train(tmp_path / "many", n_samples=64)
+    many, _ = train(tmp_path / "many", n_samples=64)
     greedy, _ = train(tmp_path / "greedy")
     for name in one.parts:
         # The same training, whatever is evaluated.

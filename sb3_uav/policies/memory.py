@@ -8,6 +8,8 @@ import torch as th
 CPU_MEMORY = 2**30
 # What encoder and decoder take per node: about 1,000 float32 in a default network, four times.
 NODE_MEMORY = 2**14
+# What the distances between all tasks take per pair of nodes: coordinates' differences, and some copies in float32.
+PAIR_MEMORY = 24
 # What splitting takes per task, sample and UAV: coordinates and indices in float64 and int64, and their copies.
 SPLIT_MEMORY = 48
 
@@ -23,5 +25,5 @@ def rows_that_fit(device: th.device, n_nodes: int, n_subsets: int = 0) -> int:
     if device.type == "cuda":
         kept = th.cuda.memory_reserved(device) - th.cuda.memory_allocated(device)
         memory = (th.cuda.mem_get_info(device)[0] + kept) // 4
-    # Linear in the nodes: torch's fused attention does not hold the matrix of scores.
-    return max(memory // (n_nodes * (NODE_MEMORY + SPLIT_MEMORY * n_subsets)), 1)
+    # Torch's fused attention does not hold the matrix of scores.
+    return max(memory // (n_nodes * (NODE_MEMORY + SPLIT_MEMORY * n_subsets + PAIR_MEMORY * n_nodes)), 1)
