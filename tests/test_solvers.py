@@ -19,6 +19,8 @@ from sb3_uav.solvers.heuristics import KMeansNearest, kmeans
 
 TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 HEURISTICS = ("kmeans-nearest", "random-nearest")
+# So many samples that augmentation keeps some back.
+MANY = 40
 
 
 def make_policy(policy_class: Any, n_uavs: int | None = None, **kwargs: Any) -> Any:
@@ -60,7 +62,7 @@ def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
     """Of any instance that is allowed; and as every task has a UAV, some task is visited if any can be reached."""
     reachable = batch.reachable().any(1).tolist()
     pair = make_pair(batch.n_uavs, decode="sampling", samples=3)
-    augmented = make_pair(batch.n_uavs, decode="augment", samples=2 * dl_drl.N_TOURS)
+    augmented = make_pair(batch.n_uavs, decode="augment", samples=MANY)
     pairs = (pair, augmented, make_pair(batch.n_uavs), make_kmeans_am())
     for solver in (*map(make_solver, HEURISTICS), *pairs):
         objectives(solver, batch)
@@ -68,10 +70,11 @@ def test_schedules_of_any_instance_are_feasible(batch: Instances) -> None:
         assert visited == reachable, solver.name
 
 
-@pytest.mark.parametrize("spec", [*HEURISTICS, "kmeans-am", "sampling"])
+@pytest.mark.parametrize("spec", [*HEURISTICS, "kmeans-am", "sampling", "augment"])
 def test_the_seed_decides(spec: str, instances: Instances) -> None:
     """Same seed, same schedules; the row of an instance, not the batch it comes in, decides what happens to it."""
-    networks = {"kmeans-am": make_kmeans_am(), "sampling": make_pair(decode="sampling", samples=3)}
+    networks: dict[str, Solver] = {"kmeans-am": make_kmeans_am(), "sampling": make_pair(decode="sampling", samples=3)}
+    networks["augment"] = make_pair(decode="augment", samples=MANY)
     solver = networks[spec] if spec in networks else make_solver(spec)
     for rows in ([5, 2], [0], []):
         expected = [(row, routes(solver, instances, 3)[row]) for row in rows]
@@ -270,13 +273,30 @@ def test_augmentation_plans_no_more_tours_than_asked_for(
     planned: list[int] = []
     plan = pair.router.plan
 
-    def counting_plan(subsets: Instances, max_rows: int | None, n_tours: int, generator: th.Generator) -> th.Tensor:
+    def counting_plan(
+        subsets: Instances, max_rows: int | None = None, n_tours: int = 1, generator: th.Generator | None = None
+    ) -> th.Tensor:
         planned.append(len(subsets) * n_tours)
         return plan(subsets, max_rows, n_tours, generator)
 
     monkeypatch.setattr(pair.router, "plan", counting_plan)
     pair.solve(instances)
-    assert 0.6 * samples * 9 * 3 <= sum(planned) <= samples * 9 * 3
+    assert sum(planned) == samples * 9 * 3
+
+
+def test_more_tours_are_tried_for_the_best_allocations_of_augmentation(
+    instances: Instances, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the last block, and they are not worse than the greedy tours of the same allocations, if seen in the same view."""
+    monkeypatch.setattr(dl_drl, "N_VIEWS", 1)
+    pair = make_pair(decode="augment", samples=MANY)
+    n_tours = MANY // 4 // dl_drl.N_REVISITED
+    *first, last = pair._blocks(instances, range(len(instances)), 0, hurry=False)
+    assert last.value.shape == (len(instances), dl_drl.N_REVISITED)
+    values = th.cat([block.value for block in first], dim=1)
+    assert values.shape[1] == MANY - dl_drl.N_REVISITED * n_tours
+    best = values.sort(dim=1, descending=True).values[:, : dl_drl.N_REVISITED]
+    assert (last.value >= best - 1e-9).all() and last.value.sum() > best.sum()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from sb3_uav.envs.allocation import PlannedTours, plan_tours, schedules
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.routing import Router
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
@@ -29,10 +30,11 @@ DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
 # the number of samples, and more samples only add to those that fewer would have drawn.
 SAMPLE_BLOCK = 64
-# Augmentation looks at an instance in so many views, all symmetries swept in both directions, and tries so many tours for each
-# subset of tasks; allocations times tours are the samples.
+# Augmentation looks at an instance in so many views, all symmetries swept in both directions, and then at samples in them.
 N_VIEWS = 2 * N_SYMMETRIES
-N_TOURS = 8
+# It keeps a part of its samples back, to try more tours for the subsets of the best few allocations. Of 128 samples, 96
+# allocations and 8 more tours for each of the best 4 found 0.6 to 1.7 % more tasks than 8 tours for each of 16 allocations.
+N_REVISITED, REVISITED_PART = 4, 0.25
 # Under a time limit less is done between two looks at the clock.
 HURRIED_BLOCK, HURRIED_VIEWS = 16, 4
 
@@ -60,7 +62,8 @@ class DLDRL(BatchedSolver):
     :param allocator: The upper level's policy
     :param router: The lower level's policy
     :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to spend
-        the samples on views of the instance (its symmetries, the sweep in both directions) and on several tours per UAV
+        the samples on views of the instance (its symmetries, the sweep in both directions) and on more tours for the UAVs of
+        the best allocations
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: How tables and files call it; says what it does when None
@@ -180,35 +183,57 @@ class DLDRL(BatchedSolver):
         :param rows: Their indices in what is being solved
         :param seed: Of the samples
         :param hurry: Whether to look at few views at once
-        :return: Schedules of all views, of which each begins with a greedy allocation
+        :return: Schedules of all views, the first of which have greedy allocations; at last more tours for the best of them
         """
-        n_tours = min(N_TOURS, self.samples)
-        n_allocations = self.samples // n_tours
+        n_tours = int(REVISITED_PART * self.samples) // N_REVISITED
+        # One more tour would be the greedy one again.
+        n_allocations = self.samples - (N_REVISITED * n_tours if n_tours > 1 else 0)
         size = HURRIED_VIEWS if hurry else N_VIEWS
+        values, assignments = [], []
         for first in range(0, n_allocations, size):
             views = [number % N_VIEWS for number in range(first, min(first + size, n_allocations))]
+            looks = [
+                self._look(instances[i], views, first >= N_VIEWS, random_generator(instances, seed, row, first))
+                for i, row in enumerate(rows)
+            ]
+            block = Block.concatenate([look[0] for look in looks])
+            values.append(block.value)
+            assignments.append(th.stack([look[1] for look in looks]))
+            yield block
+        if n_tours > 1:
+            best = th.cat(values, dim=1).sort(dim=1, descending=True, stable=True).indices[:, :N_REVISITED]
+            assignment = th.cat(assignments, dim=1)
             blocks = []
             for i, row in enumerate(rows):
-                generator = random_generator(instances, seed, row, first)
-                blocks.append(self._look(instances[i], views, first >= N_VIEWS, n_tours, generator))
+                generator = random_generator(instances, seed, row, self.samples)
+                again = plan_tours(instances[i], assignment[i, best[i]][None], self._several_tours(n_tours, generator))
+                blocks.append(Block(again.value, again.tours))
             yield Block.concatenate(blocks)
 
-    def _look(self, instance: Instances, views: Sequence[int], sampled: bool, n_tours: int, generator: th.Generator) -> Block:
+    def _several_tours(self, n_tours: int, generator: th.Generator) -> Router:
+        """
+        :param n_tours: How many tours to try for each subset
+        :param generator: The source of randomness
+        """
+        return lambda subsets: self.router.plan(subsets, None, n_tours, generator)
+
+    def _look(
+        self, instance: Instances, views: Sequence[int], sampled: bool, generator: th.Generator
+    ) -> tuple[Block, th.Tensor]:
         """
         :param instance: A batch of one on the allocator's device
         :param views: Numbers of the views
         :param sampled: Whether to sample the allocation in each of them, instead of decoding it greedily
-        :param n_tours: How many tours to try for each subset
         :param generator: The source of randomness
-        :return: The schedules
+        :return: The schedules, and the allocations ``(n_views, n_tasks)`` with the tasks in the order of the input
         """
         shown = [reflect(instance, view // 2) for view in views]
         orders = th.cat([self.allocator.task_order(seen, view % 2) for view, seen in zip(views, shown, strict=True)])
         arranged = Instances.concatenate(shown).reorder(orders)
         assignment = self.allocator.decode_episodes(arranged, 1, not sampled, generator)
-        planned = plan_tours(arranged, assignment, lambda subsets: self.router.plan(subsets, None, n_tours, generator))
+        planned = plan_tours(arranged, assignment, self.router.plan)
         tours = in_input_order(planned.tours[:, 0], orders)
-        return Block(planned.value[:, 0][None], tours[None])
+        return Block(planned.value[:, 0][None], tours[None]), th.empty_like(orders).scatter_(1, orders, assignment[:, 0])
 
     def _sample_block(
         self, instances: Instances, cache: Cache, rows: Sequence[int], seed: int, first: int, size: int
