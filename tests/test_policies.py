@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import warnings
 from functools import partial
 from typing import Any, cast
 
@@ -566,6 +567,20 @@ def test_mixed_precision_changes_little(level):
     mixed = policy.encode(instances).nodes
     assert not th.equal(plain, mixed)
     assert (plain - mixed).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("task_order, sweep, warned", [("input", True, 1), ("input", False, 0), ("sweep", True, 0)])
+def test_tasks_in_an_unwanted_order_are_pointed_out_once(task_order, sweep, warned):
+    policy: Any = AllocatorPolicy
+    env: Any = BatchedVecEnv([lambda: TaskAllocationEnv(12, 3, task_order=task_order)] * 4)
+    model = PPO(
+        AllocatorPolicy, env, n_steps=4, batch_size=8, n_epochs=1, policy_kwargs={**SMALL, "sweep": sweep}, device="cpu"
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(32)
+        model.predict(env.reset())
+    assert sum("wants the tasks in the order of a sweep" in str(warning.message) for warning in caught) == warned
 
 
 @pytest.mark.parametrize("level", LEVELS)

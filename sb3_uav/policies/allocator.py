@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import TensorDict
+from sb3_contrib.common.maskable.distributions import MaskableDistribution
+from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
 from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem
@@ -225,6 +228,7 @@ class AllocatorPolicy(EpisodicPolicy):
 
     extractor_class = AllocatorExtractor
     features_extractor: AllocatorExtractor
+    _order_is_checked = False
 
     @classmethod
     def placeholder_spaces(cls, n_actions: int | None) -> tuple[spaces.Dict, spaces.Discrete]:
@@ -246,6 +250,28 @@ class AllocatorPolicy(EpisodicPolicy):
     def env_order(self) -> str:
         """The ``task_order`` of the environments that suit it."""
         return "sweep" if self.sweep else "input"
+
+    def _decode_observation(
+        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
+    ) -> tuple[MaskableDistribution, th.Tensor]:
+        if self.sweep and not self._order_is_checked:
+            self._order_is_checked = True
+            assert isinstance(obs, dict)
+            self._check_order(StaticObservation.from_observation(obs))
+        return super()._decode_observation(obs, action_masks)
+
+    def _check_order(self, static: StaticObservation) -> None:
+        """Warn if the tasks of the first observations are not in the order that the allocator wants."""
+        depot, tasks, values, max_distance = static.depot, static.tasks, static.values, static.max_distance[:, 0]
+        order = sweep_order(Instances(depot, tasks, values, max_distance, 1, static.task_mask))
+        # Observations are rounded, which may exchange a few tasks.
+        if (order == th.arange(order.shape[1], device=order.device)).float().mean() < 0.5:
+            warnings.warn(
+                "This AllocatorPolicy wants the tasks in the order of a sweep around the depot, but the environment shows "
+                'them in another one, and schedules will be worse: make it with task_order="sweep", or the policy with '
+                "sweep=False.",
+                stacklevel=4,
+            )
 
     def task_order(self, instances: Instances, variant: int = 0) -> th.Tensor:
         if not self.sweep:
