@@ -573,9 +573,7 @@ def test_mixed_precision_changes_little(level):
 def test_tasks_in_an_unwanted_order_are_pointed_out_once(task_order, sweep, warned):
     policy: Any = AllocatorPolicy
     env: Any = BatchedVecEnv([lambda: TaskAllocationEnv(12, 3, task_order=task_order)] * 4)
-    model = PPO(
-        AllocatorPolicy, env, n_steps=4, batch_size=8, n_epochs=1, policy_kwargs={**SMALL, "sweep": sweep}, device="cpu"
-    )
+    model = PPO(policy, env, n_steps=4, batch_size=8, n_epochs=1, policy_kwargs={**SMALL, "sweep": sweep}, device="cpu")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model.learn(32)
