@@ -297,7 +297,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param bias_dim: Hidden size of what the router makes of them
     :param shared_scorer: Whether one scorer judges all UAVs of the allocator, so that it serves fleets of any size
     :param sweep: Whether the allocator wants the tasks in the order of :func:`~sb3_uav.envs.sweep.sweep_order`
-    :param mixed_precision: Whether encoders compute in bfloat16 where that is safe
+    :param mixed_precision: Whether encoders and the router's bias compute in bfloat16 where that is safe
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
     :param activation_fn: Activation function of ``net_arch``
     :param ortho_init: Whether to use SB3's orthogonal initialization

