@@ -13,11 +13,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.logger import HumanOutputFormat
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.envs.routing import Router
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.reinforce.reinforce import find_problem
 
 CallbackT = TypeVar("CallbackT", bound=BaseCallback)
 
@@ -90,10 +92,16 @@ def hand_over_router(callback: BaseCallback, router: Router) -> None:
     :param callback: A callback of the allocator's training, which has started
     :param router: The router
     """
+    model, problem = callback.model, find_problem(callback.training_env)
+    shown = getattr(problem, "task_order", None)
     for env in (callback.training_env, *(evaluation.eval_env for evaluation in siblings(callback, EvalCallback))):
         env.env_method("set_router", router)
-        if isinstance(callback.model.policy, AllocatorPolicy):
-            env.env_method("set_task_order", callback.model.policy.env_order)
+        if isinstance(model.policy, AllocatorPolicy):
+            env.env_method("set_task_order", model.policy.env_order)
+    if getattr(problem, "task_order", None) != shown and isinstance(model, OnPolicyAlgorithm):
+        # SB3 has reset the environment already, and its first episodes have the tasks in another order.
+        model._last_obs = callback.training_env.reset()  # type: ignore[assignment]
+        model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
 
 
 @contextmanager
