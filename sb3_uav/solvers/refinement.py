@@ -13,8 +13,8 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.limits import require
 
-# How many of the best schedules of an instance are repaired, in some milliseconds each. Of 128, 64 gave 0.2 to 0.8 % more tasks
-# than 8 at 80 to 200 tasks, and all of them no more.
+# How many of the best schedules of an instance are repaired, in some milliseconds each. Of 128, 64 gave 0.2 to 0.8 % more
+# tasks than 8 at 80 to 200 tasks, and all of them no more.
 N_REPAIRED = 64
 # The part of the polishing that ruin and recreate gets before PyVRP. In one second, from the same schedules, it found more
 # than PyVRP from 500 tasks on and less at 80 to 200; PyVRP with the second half lost nothing of either.
