@@ -198,7 +198,7 @@ def fused_attention(
     """
     Torch's fused kernel, always in float32, autocast or not.
 
-    With such small heads bfloat16 saves nothing on a CPU, its backward pass takes three to six times as long
+    With such small heads bfloat16 saves nothing on a CPU, its backward pass takes two to eight times as long
     (``benchmarks/attention.py``), and it would round the positions that relative attention is told.
 
     :param query: ``(batch, n_heads, n_queries, head_dim)``
