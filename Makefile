@@ -8,7 +8,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 LINT_PATHS := sb3_uav tests benchmarks examples
 # Some are about results, not speed: they take arguments and an hour.
-BENCHMARKS := $(filter-out benchmarks/_% benchmarks/ablation.py benchmarks/better_than_the_paper.py,$(sort $(wildcard benchmarks/*.py)))
+NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py)
+BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

@@ -85,7 +85,7 @@ def imitate(
         lesson = varied(lessons[int(rng.integers(len(lessons)))], rng, batch_size)
         lesson = Lesson(lesson.instances.to(router.device), lesson.tours.to(router.device))
         is_move = lesson.tours > 0
-        n_new = int((lesson.tours > 0).sum())
+        n_new = int(is_move.sum())
         log_prob = router.evaluate_episodes(lesson.instances, lesson.tours[:, None]).log_prob[:, 0]
         loss = -log_prob[is_move].sum() / max(n_new, 1)
         optimizer.zero_grad()
