@@ -165,7 +165,10 @@ def test_report_of_two_trials(tmp_path, evaluations, algo):
         assert model.learning_rate == pytest.approx(float(trial["params_learning_rate"]))
         results = np.load(folder / "evaluations.npz")
         # The mean of the last evaluation, of fractions that are exact.
-        assert float(trial["value"]) == results["results"][-1].mean() and results["results"].shape == (2, 4)
+        assert float(trial["value"]) == results["results"][-1].mean()
+        # Whole epochs of 8 instances are played, and how long their episodes are depends on rounding: one evaluation more may fit.
+        n_evaluations, n_episodes = results["results"].shape
+        assert n_evaluations in (2, 3) and n_episodes == 4
         # Our own evaluation is for the final training.
         assert "sampled" not in results
     assert len(evaluations.illegal) >= 2 * 2 * 4 * 2 and not any(evaluations.illegal)
