@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,9 +17,10 @@ from sb3_uav.envs.instances import MixtureGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+from sb3_uav.training.its import CHECKPOINT_FOLDER, WARM_START_FOLDER, read_state
 
 pytest.importorskip("numba")
+from sb3_uav.solvers import imitation
 from sb3_uav.solvers.imitation import Lesson, good_tours, imitate, search_lessons, varied
 
 WARM_START = {"sb3_uav.solvers.imitation.imitate": {"n_subsets": 40, "n_updates": 4, "batch_size": 8}}
@@ -65,6 +68,69 @@ def test_the_same_numbers_give_the_same_router(allocator: Any) -> None:
         imitate(router, allocator, MixtureGenerator(50, 4), np.random.default_rng(3), 40, 3, 8)
         found.append(parameters(router))
     assert th.equal(*found) and not th.equal(found[0], parameters(make_policy(RouterPolicy)))
+
+
+@pytest.mark.parametrize(
+    "n_searched, n_updated", [(1, 99), (3, 99), (99, 0), (99, 5)], ids=["search", "later", "begin", "updates"]
+)
+def test_an_interrupted_imitation_goes_on(
+    allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_searched: int, n_updated: int
+) -> None:
+    """With the same result, and without doing anything twice that was saved."""
+    monkeypatch.setattr(imitation, "CHUNK_SIZE", 20)
+    monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
+
+    def learned(folder: Path | None) -> th.Tensor:
+        router = make_policy(RouterPolicy)
+        imitate(router, allocator, MixtureGenerator(30, 4), np.random.default_rng(3), 90, 7, 8, folder=folder)
+        return parameters(router)
+
+    expected = learned(None)
+    with monkeypatch.context() as patch:
+        counts = {"good_tours": n_searched, "varied": n_updated}
+        for name, function in (("good_tours", good_tours), ("varied", varied)):
+
+            def interrupted(*args: Any, name: str = name, function: Any = function) -> Any:
+                counts[name] -= 1
+                if counts[name] < 0:
+                    raise KeyboardInterrupt
+                return function(*args)
+
+            patch.setattr(imitation, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            learned(tmp_path)
+    spy = Mock(side_effect=varied)
+    monkeypatch.setattr(imitation, "varied", spy)
+    assert th.equal(learned(tmp_path), expected)
+    assert spy.call_count == 7 - (4 if n_updated == 5 else 0)
+    # And once more, where nothing but the last update is left.
+    assert th.equal(learned(tmp_path), expected) and spy.call_count <= 8
+
+
+def test_wrong_progress(allocator: Any, tmp_path: Path) -> None:
+    def learn(n_updates: int = 1, **network: Any) -> None:
+        router = make_policy(RouterPolicy, **network)
+        imitate(router, allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, n_updates, 8, folder=tmp_path)
+
+    learn()
+    with pytest.raises(ValueError, match=r"lessons_0.pt: belongs to an imitation with .*'n_updates': 1.*; remove"):
+        learn(2)
+    path = tmp_path / "lessons_0.pt"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"lessons_0.pt: not an intact file"):
+        learn()
+
+
+def test_progress_of_another_network(allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "SAVE_EVERY", 1)
+    for embed_dim in (8, 16):
+        router = make_policy(RouterPolicy, embed_dim=embed_dim)
+        arguments = (router, allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, 1, 8)
+        if embed_dim == 8:
+            imitate(*arguments, folder=tmp_path)
+            continue
+        with pytest.raises(ValueError, match=r"updates.pt: of another network"):
+            imitate(*arguments, folder=tmp_path)
 
 
 def test_variants_are_the_same_tours(allocator: Any) -> None:
@@ -126,6 +192,50 @@ def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[st
     again = make_its(save_path=str(tmp_path), verbose=1, n_epochs=2)
     model.learn(10**9, callback=again, reset_num_timesteps=False)
     assert "imitation" not in capsys.readouterr().out and again.epoch == 2
+
+
+def test_its_goes_on_with_it(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that was interrupted in its warm start goes on in another folder, and ends as if it had not been interrupted."""
+    monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
+    expected = make_its(save_path=str(tmp_path / "expected"))
+    make_model().learn(10**9, callback=expected)
+    calls = []
+
+    def interrupted(*args: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return varied(*args)
+
+    monkeypatch.setattr(imitation, "varied", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_model().learn(10**9, callback=make_its(save_path=str(tmp_path / "first")))
+    first = tmp_path / "first" / CHECKPOINT_FOLDER
+    assert (first / WARM_START_FOLDER / "updates.pt").is_file()
+    model = REINFORCE.load(first / read_state(first)["allocator"], env=make_model().env, device="cpu")
+    again = make_its(save_path=str(tmp_path / "second"))
+    model.learn(10**9, callback=again)
+    # The last two of four updates were not saved; the third was begun twice.
+    assert len(calls) == 4 + 2 and again.epoch == 1
+    assert th.equal(parameters(again.router.policy), parameters(expected.router.policy))
+    assert not (tmp_path / "second" / CHECKPOINT_FOLDER / WARM_START_FOLDER).exists()
+    assert (first / WARM_START_FOLDER).exists()
+
+
+def test_a_warm_start_of_the_users_own() -> None:
+    """It need not report, nor keep anything."""
+    with pytest.warns(UserWarning, match="ITSCallback saves no router"):
+        callback = make_its(warm_start={f"{__name__}.zero_router": {"value": 0.5}})
+        make_model().learn(10**9, callback=callback)
+    assert STARTED == [0.5]
+
+
+STARTED: list[float] = []
+
+
+def zero_router(router: Any, allocator: Any, generator: Any, rng: np.random.Generator, value: float) -> None:
+    assert isinstance(router, RouterPolicy) and isinstance(allocator, AllocatorPolicy)
+    STARTED.append(value)
 
 
 @pytest.mark.filterwarnings("ignore:ITSCallback saves no router")

@@ -166,7 +166,7 @@ def test_report_of_two_trials(tmp_path, evaluations, algo):
         results = np.load(folder / "evaluations.npz")
         # The mean of the last evaluation, of fractions that are exact.
         assert float(trial["value"]) == results["results"][-1].mean()
-        # Whole epochs of 8 instances are played, and how long their episodes are depends on rounding: one evaluation more may fit.
+        # Whole epochs of 8 instances are played. How long their episodes are depends on rounding: one evaluation more may fit.
         n_evaluations, n_episodes = results["results"].shape
         assert n_evaluations in (2, 3) and n_episodes == 4
         # Our own evaluation is for the final training.

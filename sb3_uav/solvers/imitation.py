@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 import torch as th
@@ -16,6 +16,7 @@ from sb3_uav.envs.instances import InstanceGenerator, Instances, training_batch
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import turn
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.solvers.imitation_progress import ImitationProgress, Lesson
 from sb3_uav.solvers.local_search import LocalSearch
 
 # A batch holds as many subsets of so many tasks as it is said to have; of larger ones fewer.
@@ -26,18 +27,9 @@ WARM_UP = 50
 LAST_RATE = 0.02
 MAX_GRAD_NORM = 1.0
 REPORT_EVERY = 250
-
-
-class Lesson(NamedTuple):
-    """
-    Subsets and good tours through them.
-
-    :param instances: ``batch`` single-UAV instances
-    :param tours: ``(batch, n_steps)`` int64 nodes, padded with the depot
-    """
-
-    instances: Instances
-    tours: th.Tensor
+# After so many updates, and so many tours, progress is saved.
+SAVE_EVERY = 500
+CHUNK_SIZE = 10_000
 
 
 def imitate(
@@ -50,6 +42,7 @@ def imitate(
     batch_size: int = 64,
     learning_rate: float = 2e-3,
     report: Callable[[str], None] = lambda _: None,
+    folder: str | Path | None = None,
 ) -> None:
     """
     Train a router on the tours of local search, by the likelihood of their moves.
@@ -66,19 +59,25 @@ def imitate(
     :param batch_size: Subsets of an update, if they have 30 tasks; of larger ones it takes fewer
     :param learning_rate: The highest rate of Adam
     :param report: Is told how far it is
+    :param folder: Where to keep the progress; what is there is gone on from, with the same result as without an interruption
     :raises ImportError: If numba is not installed
-    :raises ValueError: If a number is not above 0
+    :raises ValueError: If a number is not above 0, or the folder holds the progress of other settings or damaged files
     """
     for name, value in (("n_subsets", n_subsets), ("n_updates", n_updates), ("batch_size", batch_size)):
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1.")
     if not learning_rate > 0:
         raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
-    lessons = search_lessons(allocator, generator, rng, n_subsets, batch_size, report)
+    settings = dict(n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size, learning_rate=learning_rate)
+    progress = None if folder is None else ImitationProgress(Path(folder), settings)
+    lessons = search_lessons(allocator, generator, rng, n_subsets, batch_size, report, progress)
     optimizer = th.optim.Adam(router.parameters(), learning_rate)
+    n_done = 0 if progress is None else progress.restore_updates(router, optimizer, rng)
+    if n_done > 0:
+        report(f"imitation: goes on after {n_done} of {n_updates} updates")
     start, total, n_moves = time.perf_counter(), th.zeros((), device=router.device), 0
     router.set_training_mode(True)
-    for update in range(1, n_updates + 1):
+    for update in range(n_done + 1, n_updates + 1):
         cosine = 0.5 * (1 + math.cos(math.pi * update / n_updates))
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * min(1.0, update / WARM_UP) * (LAST_RATE + (1 - LAST_RATE) * cosine)
@@ -97,6 +96,8 @@ def imitate(
             seconds, nats = time.perf_counter() - start, total.item() / max(n_moves, 1)
             report(f"imitation: {update} of {n_updates} updates, {nats:.3f} nats a move, {seconds:.0f} s")
             total, n_moves = th.zeros_like(total), 0
+        if progress is not None and update % SAVE_EVERY == 0:
+            progress.save_updates(update, router, optimizer, rng)
     router.set_training_mode(False)
 
 
@@ -107,6 +108,7 @@ def search_lessons(
     n_subsets: int,
     batch_size: int,
     report: Callable[[str], None] = lambda _: None,
+    progress: ImitationProgress | None = None,
 ) -> list[Lesson]:
     """
     :param allocator: Splits the tasks
@@ -115,9 +117,12 @@ def search_lessons(
     :param n_subsets: How many subsets there shall be at least
     :param batch_size: As for :func:`imitate`
     :param report: Is told how far it is
+    :param progress: Keeps what was found, and knows what was found before
     :return: Subsets of similar sizes, with tours
     """
-    lessons, n_found, start = [], 0, time.perf_counter()
+    start = time.perf_counter()
+    lessons = [] if progress is None else progress.restore_lessons(rng)
+    n_found, n_saved = sum(len(lesson.tours) for lesson in lessons), len(lessons)
     allocator.set_training_mode(False)
     while n_found < n_subsets:
         instances = allocator.arrange(training_batch(generator, max(batch_size // 2, 1), rng))
@@ -129,8 +134,11 @@ def search_lessons(
         subsets = subsets.trim(max(int(subsets.task_mask.sum(1).max()), 1))
         lessons.append(Lesson(subsets, good_tours(subsets)))
         before, n_found = n_found, n_found + len(subsets)
-        if n_found // 10_000 > before // 10_000:
+        if n_found // CHUNK_SIZE > before // CHUNK_SIZE or n_found >= n_subsets:
             report(f"imitation: {n_found} of {n_subsets} tours, {time.perf_counter() - start:.0f} s")
+            if progress is not None:
+                progress.save_lessons(lessons[n_saved:], rng)
+                n_saved = len(lessons)
     return lessons
 
 

@@ -7,6 +7,7 @@ import inspect
 import io
 import json
 import re
+import shutil
 import time
 import warnings
 from dataclasses import asdict, dataclass
@@ -56,6 +57,7 @@ STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&inte
 
 CHECKPOINT_FOLDER = "its_checkpoint"
 STATE_FILE = "its_state.json"
+WARM_START_FOLDER = "warm_start"
 # An attribute of the allocator, so that any zip of it knows its last checkpoint: stock rl_zoo3 does not tell callbacks which
 # zip it goes on from.
 CHECKPOINT = "its_checkpoint"
@@ -163,7 +165,9 @@ class ITSCallback(BaseCallback):
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
     :param warm_start: What gives the router a start before anything else, by its dotted path, and its arguments, as in
         ``{"sb3_uav.solvers.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
-        the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`
+        the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`. If it has the
+        arguments ``report`` and ``folder``, it gets a function to tell its progress to, and where to keep it, so that a run
+        that goes on from a checkpoint of before its end can go on with it
     :param n_epochs: Allocator epochs (the paper's E)
     :param n_pretraining_epochs: Router epochs of pre-training (E_p)
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
@@ -237,6 +241,7 @@ class ITSCallback(BaseCallback):
         self._statistics = EpisodeStatistics()
         self._subsets: AllocatedSubsets | None = None
         self._started = False
+        self._warm_started = warm_start is None
         self._epoch_start = 0.0
         self._epoch_first_batch = 0
         self._instances_at_start = 0
@@ -279,7 +284,7 @@ class ITSCallback(BaseCallback):
                     "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
                     f"{CHECKPOINT_FOLDER} folder of the earlier run."
                 )
-            elif self.warm_start is not None:
+            if self.warm_start is not None and not self._warm_started:
                 self._start_router(self.warm_start)
             self._started = True
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
@@ -345,14 +350,34 @@ class ITSCallback(BaseCallback):
             if self.verbose > 0:
                 print(text, flush=True)
 
+        folder = self._warm_start_folder()
         positional = (self.router.policy, self.model.policy, self.problem.generator, rng)
+        signature = inspect.signature(function)
+        offered = {"report": report, "folder": folder}
+        known = {name: value for name, value in offered.items() if name in signature.parameters}
         try:
-            call = inspect.signature(function).bind(*positional, **{"report": report, **(arguments or {})})
+            call = signature.bind(*positional, **known, **(arguments or {}))
         except TypeError as error:
             raise ValueError(f"warm_start: these arguments do not fit {path}: {error}") from error
+        # From here on an interrupted run can go on.
+        self._save_checkpoint()
         with undisturbed_random_state():
             function(*call.args, **call.kwargs)
+        self._warm_started = True
         self._save_checkpoint()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _warm_start_folder(self) -> Path | None:
+        """Where the warm start keeps its progress; that of the checkpoint which this run goes on from is copied there."""
+        if self.save_path is None:
+            return None
+        folder = self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
+        if self.resume_from is not None:
+            earlier = self.resume_from / WARM_START_FOLDER
+            if earlier.is_dir() and earlier.resolve() != folder.resolve():
+                shutil.copytree(earlier, folder, dirs_exist_ok=True)
+        return folder
 
     @property
     def _router_policy(self) -> BasePolicy:
@@ -593,7 +618,8 @@ class ITSCallback(BaseCallback):
         names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self._n_router_epochs()}.zip"}
         save_atomically(self.model, folder / names["allocator"])
         save_atomically(self.router, folder / names["router"])
-        state = {"epoch": self.epoch, **names, "records": [asdict(record) for record in self.records]}
+        records = [asdict(record) for record in self.records]
+        state = {"epoch": self.epoch, **names, "warm_started": self._warm_started, "records": records}
         write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
         for old in folder.iterdir():
             if re.fullmatch(r"(allocator|router)_\d+\.zip", old.name) and old.name not in names.values():
@@ -609,6 +635,8 @@ class ITSCallback(BaseCallback):
                 f"train the allocator of {folder / state['allocator']}."
             )
         self.epoch = state["epoch"]
+        # Until version 0.1.0 the first checkpoint was written after the warm start.
+        self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         try:
             with undisturbed_random_state():
