@@ -359,6 +359,17 @@ def test_resumed_run_equals_an_unbroken_one(baseline, epochs, tmp_path):
     ]
 
 
+def test_a_resumed_router_has_the_settings_of_now(tmp_path):
+    """As rl_zoo3 gives the allocator those of the YAML, not those of the zip."""
+    learn(make_allocator(), make_its(save_path=str(tmp_path)))
+    folder = tmp_path / CHECKPOINT_FOLDER
+    resumed = REINFORCE.load(folder / read_state(folder)["allocator"], env=make_env())
+    its = make_its(dict(learning_rate=5e-3, max_grad_norm=0.5), n_epochs=7, resume_from=str(folder), save_path=str(tmp_path))
+    resumed.learn(10**9, callback=its, reset_num_timesteps=False)
+    assert its.epoch == 7 and its.router.max_grad_norm == 0.5
+    assert {group["lr"] for group in its.router.policy.optimizer.param_groups} == {5e-3}
+
+
 def test_interrupted_during_the_router_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     its = make_its(save_path=str(tmp_path))
     original = ITSCallback._train_router

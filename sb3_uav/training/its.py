@@ -62,6 +62,8 @@ WARM_START_FOLDER = "warm_start"
 # zip it goes on from.
 CHECKPOINT = "its_checkpoint"
 LOG_FILE = "its_log.csv"
+# What of the router's settings is not an argument of its algorithm, or cannot change when a run goes on.
+ROUTER_NETWORK = {"algo", "n_envs", "policy", "policy_kwargs"}
 BEST_ROUTER_FILE = "best_router.zip"
 
 
@@ -638,9 +640,13 @@ class ITSCallback(BaseCallback):
         # Until version 0.1.0 the first checkpoint was written after the warm start.
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
+        # As rl_zoo3 does with the allocator: the settings are those of now, the networks those of the zip.
+        settings = {key: value for key, value in self.router_kwargs.items() if key not in ROUTER_NETWORK}
         try:
             with undisturbed_random_state():
-                loaded = type(self.router).load(folder / state["router"], env=self._router_env, device=self.model.device)
+                loaded = type(self.router).load(
+                    folder / state["router"], env=self._router_env, device=self.model.device, **settings
+                )
         except (ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"{folder / state['router']}: not an intact router ({error}); use another checkpoint.") from error
         loaded.set_logger(self.router.logger)
