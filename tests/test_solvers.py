@@ -202,6 +202,25 @@ def test_as_many_samples_as_asked_for(samples: int, instances: Instances, monkey
     assert sum(planned) == samples * 9 * 3
 
 
+def test_blocks_of_samples_take_turns_with_directions(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The allocator sees each instance in both directions of the sweep, and a third block like the first."""
+    monkeypatch.setattr(dl_drl, "SAMPLE_BLOCK", 2)
+    pair = make_pair(decode="sampling", samples=6, batch_size=9)
+    seen: list[th.Tensor] = []
+    decode = pair.allocator.decode_episodes
+
+    def noting(shown: Instances, *args: Any, **kwargs: Any) -> th.Tensor:
+        seen.append(shown.tasks)
+        return decode(shown, *args, **kwargs)
+
+    monkeypatch.setattr(pair.allocator, "decode_episodes", noting)
+    pair.solve(instances)
+    first, second, third = (th.cat(seen[start : start + 9]) for start in (0, 9, 18))
+    assert len(seen) == 27 and th.equal(first, third) and not th.equal(first, second)
+    order = pair.allocator.task_order(instances, 1)
+    assert th.equal(second, instances.reorder(order).tasks)
+
+
 def test_sampling_follows_the_seed(instances: Instances) -> None:
     pair = make_pair(decode="sampling", samples=2)
     th.manual_seed(1)
