@@ -9,8 +9,9 @@ encoding, the others one, so both rates and both ratios are printed.
     The settings of ``TaskAllocation-Universal-v0`` in ``zoo_configs/reinforce.yml``: 8 samples and their mean as the baseline.
 ``paper``
     The settings of ``paper-U4`` and ``paper-router`` there: width 128, 3 layers, 8 heads, batch normalization, one sample and
-    one greedy rollout of the baseline's policy. The paper also pads the subsets of all UAVs to one size by repeating tasks,
-    which our code does not, so this favours the paper. Its router is the attention model: the like of ``rl4co-paper``.
+    one greedy rollout of the baseline's policy. As in the paper, the subsets of all UAVs are padded to one size before tours
+    are planned; but what they are padded with is masked, while the paper repeats tasks, which makes tours longer, so this
+    favours the paper. Its router is the attention model: the like of ``rl4co-paper``.
 ``plain``
     The router as in ``paper``, but with layers, width, heads and normalization of ``default``: the like of ``rl4co-default``.
 ``rl4co-paper``, ``rl4co-default``
@@ -59,9 +60,13 @@ import warnings
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch as th
+
+if TYPE_CHECKING:
+    from sb3_uav.envs.routing import Router
+    from sb3_uav.policies import RouterPolicy
 
 # sb3_uav is imported where it is needed: this file also runs in RL4CO's environment, which need not have it.
 
@@ -162,6 +167,14 @@ def router_shape(name: str) -> dict[str, Any]:
     return {key: network[key] for key in SHAPE}
 
 
+def padded_plan(router: RouterPolicy) -> Router:
+    """
+    :param router: A router
+    :return: What plans with it as the paper does: all subsets at once, as large as the largest of them
+    """
+    return lambda subsets: router.decode_episodes(subsets)[:, 0]
+
+
 class Ours:
     """
     ``REINFORCE`` of this package.
@@ -188,7 +201,8 @@ class Ours:
         def make_env() -> Any:
             if level == "router":
                 return route_env
-            return TaskAllocationEnv(args.n_tasks, args.n_uavs, args.max_distance, router=router.plan)
+            plan = padded_plan(router) if name == "paper" else router.plan
+            return TaskAllocationEnv(args.n_tasks, args.n_uavs, args.max_distance, router=plan)
 
         env = BatchedVecEnv([make_env] * args.batch_size)
         self.model = REINFORCE(policy, env, device="cpu", seed=0, **settings[level])

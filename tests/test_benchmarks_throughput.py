@@ -5,7 +5,13 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch as th
+
+from sb3_uav.envs import UniformGenerator
+from sb3_uav.envs.allocation import plan_tours
+from sb3_uav.policies import RouterPolicy
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "training_throughput.py"
 TINY = ["--n-tasks", "5", "--n-uavs", "2", "--batch-size", "4", "--epoch-batches", "1", "--seconds", "0.01", "--rounds", "2"]
@@ -42,6 +48,15 @@ def test_settings(benchmark):
     expected = dict(embed_dim=128, n_layers=3, n_heads=8, ff_dim=512, normalization="batch")
     assert benchmark.router_shape("paper") == expected
     assert plain["policy_kwargs"] == {"preset": "paper", **benchmark.router_shape("default")}
+
+
+def test_padded_subsets_get_the_same_tours(benchmark):
+    """Padding costs time and nothing else."""
+    router = RouterPolicy(*RouterPolicy.placeholder_spaces(None), lambda _: 0.0, embed_dim=8, n_heads=2, ff_dim=8)
+    instances = UniformGenerator(12, 2)(4, np.random.default_rng(0))
+    assignment = th.from_numpy(np.random.default_rng(1).integers(2, size=(4, 3, 12)))
+    ours, padded = (plan_tours(instances, assignment, plan) for plan in (router.plan, benchmark.padded_plan(router)))
+    assert th.equal(ours.value, padded.value)
 
 
 def test_a_failing_rl4co_is_reported(benchmark, tmp_path):

@@ -63,9 +63,9 @@ class DLDRL(BatchedSolver):
 
     :param allocator: The upper level's policy
     :param router: The lower level's policy
-    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations (of an allocator that sweeps, in
-        both directions of the sweep), or ``"augment"`` to spend the samples on views of the instance (its symmetries, the
-        sweep in both directions) and on more tours for the UAVs of the best allocations
+    :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations (half of them with the tasks
+        swept the other way round, if the allocator wants them swept), or ``"augment"`` to spend the samples on views of the
+        instance (its symmetries, the sweep in both directions) and on more tours for the UAVs of the best allocations
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: How tables and files call it; says what it does when None
