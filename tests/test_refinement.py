@@ -61,13 +61,13 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
     pair = make_pair(decode="sampling", samples=64, repair=True, polish=9.0)
     drawn: list[int] = []
     spent: list[float] = []
-    sample_block = pair._sample_block
+    look = pair._look
 
-    def counting(*args: Any) -> th.Tensor:
-        block = sample_block(*args)
-        drawn.append(block.shape[1])
-        clock.now += 0.2  # type: ignore[attr-defined]
-        return block
+    def counting(*args: Any) -> Any:
+        seen = look(*args)
+        drawn.append(len(seen.assignment))
+        clock.now += 0.05  # type: ignore[attr-defined]
+        return seen
 
     def clock() -> float:
         clock.now += 1e-4  # type: ignore[attr-defined]
@@ -78,17 +78,17 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
         return schedule
 
     clock.now = 0.0  # type: ignore[attr-defined]
-    monkeypatch.setattr(pair, "_sample_block", counting)
+    monkeypatch.setattr(pair, "_look", counting)
     monkeypatch.setattr("sb3_uav.solvers.refinement.polish", noting)
     monkeypatch.setattr(time, "perf_counter", clock)
     pair.solve(instances, time_limit=0.5)
     some = sum(drawn)
-    assert 0 < some < 64 and len(spent) == len(instances)
+    assert 0 < some < 64 * len(instances) and len(spent) == len(instances)
     # Two seconds for the four of them, less what the networks and the repair took.
     assert 0 < sum(spent) < 2.0
     drawn.clear()
     pair.solve(instances, time_limit=50.0)
-    assert sum(drawn) == 64 and max(spent) == 9.0
+    assert sum(drawn) == 64 * len(instances) and max(spent) == 9.0
 
 
 def test_plain_networks_need_no_time_limit(instances: Instances) -> None:

@@ -202,23 +202,25 @@ def test_as_many_samples_as_asked_for(samples: int, instances: Instances, monkey
     assert sum(planned) == samples * 9 * 3
 
 
-def test_blocks_of_samples_take_turns_with_directions(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The allocator sees each instance in both directions of the sweep, and a third block like the first."""
-    monkeypatch.setattr(dl_drl, "SAMPLE_BLOCK", 2)
-    pair = make_pair(decode="sampling", samples=6, batch_size=9)
+@pytest.mark.parametrize("sweep", [True, False])
+def test_samples_begin_at_several_gaps(sweep: bool, instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An allocator that sweeps sees an instance in several orders; one that does not, as it is given."""
+    pair = DLDRL(make_policy(AllocatorPolicy, 3, sweep=sweep), make_policy(RouterPolicy), decode="sampling", samples=9)
     seen: list[th.Tensor] = []
     decode = pair.allocator.decode_episodes
 
-    def noting(shown: Instances, *args: Any, **kwargs: Any) -> th.Tensor:
+    def noting(shown: Instances, *args: Any) -> th.Tensor:
         seen.append(shown.tasks)
-        return decode(shown, *args, **kwargs)
+        return decode(shown, *args)
 
     monkeypatch.setattr(pair.allocator, "decode_episodes", noting)
     pair.solve(instances)
-    first, second, third = (th.cat(seen[start : start + 9]) for start in (0, 9, 18))
-    assert len(seen) == 27 and th.equal(first, third) and not th.equal(first, second)
-    order = pair.allocator.task_order(instances, 1)
-    assert th.equal(second, instances.reorder(order).tasks)
+    assert len(seen) == len(instances)
+    for i, tasks in enumerate(seen):
+        orders = [pair.allocator.task_order(instances[i], variant) for variant in range(len(tasks))]
+        assert th.equal(tasks, th.cat([instances[i].reorder(order).tasks for order in orders]))
+        different = {tuple(order.flatten().tolist()) for order in orders}
+        assert len(different) == dl_drl.N_SWEEPS == 8 if sweep else len(orders) == 1
 
 
 def test_sampling_follows_the_seed(instances: Instances) -> None:
@@ -301,6 +303,15 @@ def test_augmentation_plans_no_more_tours_than_asked_for(
     monkeypatch.setattr(pair.router, "plan", counting_plan)
     pair.solve(instances)
     assert sum(planned) == samples * 9 * 3
+
+
+def test_views_of_augmentation() -> None:
+    """First all symmetries in both directions from the widest gap, then the same from the next gap."""
+    views = [dl_drl.view_of(number) for number in range(3 * dl_drl.N_VIEWS)]
+    assert len(set(views)) == len(views)
+    for turn in range(3):
+        of_turn = views[turn * dl_drl.N_VIEWS : (turn + 1) * dl_drl.N_VIEWS]
+        assert {view.symmetry for view in of_turn} == set(range(8)) and {view.sweep // 2 for view in of_turn} == {turn}
 
 
 def test_more_tours_are_tried_for_the_best_allocations_of_augmentation(
