@@ -85,7 +85,11 @@ def test_an_interrupted_imitation_goes_on(
         imitate(router, allocator, MixtureGenerator(30, 4), np.random.default_rng(3), 90, 7, 8, folder=folder)
         return parameters(router)
 
-    expected = learned(None)
+    searches, updates = Mock(side_effect=good_tours), Mock(side_effect=varied)
+    with monkeypatch.context() as patch:
+        patch.setattr(imitation, "good_tours", searches)
+        expected = learned(None)
+    n_all = searches.call_count
     with monkeypatch.context() as patch:
         counts = {"good_tours": n_searched, "varied": n_updated}
         for name, function in (("good_tours", good_tours), ("varied", varied)):
@@ -99,12 +103,15 @@ def test_an_interrupted_imitation_goes_on(
             patch.setattr(imitation, name, interrupted)
         with pytest.raises(KeyboardInterrupt):
             learned(tmp_path)
-    spy = Mock(side_effect=varied)
-    monkeypatch.setattr(imitation, "varied", spy)
+    searches.reset_mock()
+    monkeypatch.setattr(imitation, "good_tours", searches)
+    monkeypatch.setattr(imitation, "varied", updates)
     assert th.equal(learned(tmp_path), expected)
-    assert spy.call_count == 7 - (4 if n_updated == 5 else 0)
+    n_again = 7 - (4 if n_updated == 5 else 0)
+    assert updates.call_count == n_again
+    assert searches.call_count == 0 if n_searched == 99 else 0 < searches.call_count <= n_all - (n_searched > 1)
     # And once more, where nothing but the last update is left.
-    assert th.equal(learned(tmp_path), expected) and spy.call_count <= 8
+    assert th.equal(learned(tmp_path), expected) and updates.call_count == n_again + 1
 
 
 def test_wrong_progress(allocator: Any, tmp_path: Path) -> None:
@@ -123,14 +130,14 @@ def test_wrong_progress(allocator: Any, tmp_path: Path) -> None:
 
 def test_progress_of_another_network(allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(imitation, "SAVE_EVERY", 1)
-    for embed_dim in (8, 16):
+
+    def learn(embed_dim: int) -> None:
         router = make_policy(RouterPolicy, embed_dim=embed_dim)
-        arguments = (router, allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, 1, 8)
-        if embed_dim == 8:
-            imitate(*arguments, folder=tmp_path)
-            continue
-        with pytest.raises(ValueError, match=r"updates.pt: of another network"):
-            imitate(*arguments, folder=tmp_path)
+        imitate(router, allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, 1, 8, folder=tmp_path)
+
+    learn(8)
+    with pytest.raises(ValueError, match=r"updates.pt: of another network"):
+        learn(16)
 
 
 def test_variants_are_the_same_tours(allocator: Any) -> None:
@@ -215,7 +222,7 @@ def test_its_goes_on_with_it(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> 
     model = REINFORCE.load(first / read_state(first)["allocator"], env=make_model().env, device="cpu")
     again = make_its(save_path=str(tmp_path / "second"))
     model.learn(10**9, callback=again)
-    # The last two of four updates were not saved; the third was begun twice.
+    # The last two of four updates were not saved, and done again.
     assert len(calls) == 4 + 2 and again.epoch == 1
     assert th.equal(parameters(again.router.policy), parameters(expected.router.policy))
     assert not (tmp_path / "second" / CHECKPOINT_FOLDER / WARM_START_FOLDER).exists()
@@ -244,6 +251,7 @@ def zero_router(router: Any, allocator: Any, generator: Any, rng: np.random.Gene
     [
         ({}, "warm_start must map the dotted path of one function to its arguments"),
         ({"sb3_uav.nothing.at_all": {}}, "warm_start is 'sb3_uav.nothing.at_all', which cannot be imported"),
+        ({"sb3_uav.solvers.imitation.WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
         ({"sb3_uav.solvers.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),
     ],
 )

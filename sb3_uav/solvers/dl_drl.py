@@ -32,8 +32,8 @@ SAMPLE_BLOCK = 64
 # An allocator that sweeps starts at several gaps between the tasks, in both directions: so the best of 128 samples found 0.6
 # to 1.4 % more tasks than when all began at the widest one. The number of sweeps divides the sizes of blocks.
 N_SWEEPS = 8
-# Augmentation looks at an instance in so many views, all symmetries swept in both directions, then at samples in them and from
-# other gaps.
+# Augmentation looks at an instance in so many views, all symmetries swept in both directions, then at samples in the same with
+# sweeps from other gaps.
 N_DIRECTIONS = 2
 N_VIEWS = N_DIRECTIONS * N_SYMMETRIES
 # It keeps a part of its samples back, to try more tours for the subsets of the best few allocations. Of 128 samples, 96
@@ -284,7 +284,10 @@ class Allocations(NamedTuple):
     assignment: th.Tensor
 
     def first(self, n_allocations: int) -> Allocations:
-        """:param n_allocations: How many to keep"""
+        """
+        :param n_allocations: How many to keep
+        :return: Only these
+        """
         return Allocations(self.instances[:n_allocations], self.order[:n_allocations], self.assignment[:n_allocations])
 
     def in_input_order(self) -> th.Tensor:

@@ -60,7 +60,9 @@ def imitate(
     :param learning_rate: The highest rate of Adam
     :param report: Is told how far it is
     :param folder: Where to keep the progress; what is there is gone on from, with the same result as without an interruption
+        if everything else is the same
     :raises ImportError: If numba is not installed
+    :raises OSError: If the progress cannot be written
     :raises ValueError: If a number is not above 0, or the folder holds the progress of other settings or damaged files
     """
     for name, value in (("n_subsets", n_subsets), ("n_updates", n_updates), ("batch_size", batch_size)):

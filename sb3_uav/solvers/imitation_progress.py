@@ -35,7 +35,7 @@ class ImitationProgress:
     Lessons and updates so far, as plain tensors: nothing in the files is executed when they are read.
 
     :param folder: Where the files are, or are going to be
-    :param settings: Of the imitation; the files must have been written with the same
+    :param settings: Of the imitation; the files must have been written with the same, and for the same generator and seed
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
@@ -47,9 +47,12 @@ class ImitationProgress:
         """
         :param lessons: New ones
         :param rng: What they were drawn from
+        :raises OSError: If the file cannot be written
         """
+        # Copies, because torch saves all that a view is a part of.
         content = [
-            {"tours": lesson.tours} | {name: getattr(lesson.instances, name) for name in INSTANCE_FIELDS} for lesson in lessons
+            {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in INSTANCE_FIELDS}
+            for lesson in lessons
         ]
         self._write(self._chunk_file(), rng, {"lessons": content})
         self._n_chunks += 1
@@ -76,6 +79,7 @@ class ImitationProgress:
         :param router: What has learned
         :param optimizer: Its optimizer
         :param rng: What chose the lessons
+        :raises OSError: If the file cannot be written
         """
         learned = {"n_updates": n_updates, "router": router.state_dict(), "optimizer": optimizer.state_dict()}
         self._write(self.folder / "updates.pt", rng, learned)
@@ -110,8 +114,9 @@ class ImitationProgress:
     def _read(self, path: Path, rng: np.random.Generator) -> dict[str, Any] | None:
         if not path.is_file():
             return None
+        stored = io.BytesIO(path.read_bytes())
         try:
-            content = th.load(path, map_location="cpu", weights_only=True)
+            content = th.load(stored, map_location="cpu", weights_only=True)
             state, settings = json.loads(content["rng"]), content["settings"]
         except Exception as error:
             # Torch raises all kinds of them.

@@ -62,8 +62,8 @@ WARM_START_FOLDER = "warm_start"
 # zip it goes on from.
 CHECKPOINT = "its_checkpoint"
 LOG_FILE = "its_log.csv"
-# What of the router's settings is not an argument of its algorithm, or cannot change when a run goes on.
-ROUTER_NETWORK = {"algo", "n_envs", "policy", "policy_kwargs"}
+# Settings of the router that follow from the environment, or that its zip decides when a run goes on.
+NOT_RELOADED = {"algo", "n_envs", "policy", "policy_kwargs"}
 BEST_ROUTER_FILE = "best_router.zip"
 
 
@@ -168,8 +168,9 @@ class ITSCallback(BaseCallback):
     :param warm_start: What gives the router a start before anything else, by its dotted path, and its arguments, as in
         ``{"sb3_uav.solvers.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
         the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`. If it has the
-        arguments ``report`` and ``folder``, it gets a function to tell its progress to, and where to keep it, so that a run
-        that goes on from a checkpoint of before its end can go on with it
+        arguments ``report`` and ``folder``, it gets a function to tell its progress to, and a folder to keep it in (None
+        without ``save_path``), so that a run that goes on from the checkpoint of before its end can go on with it; the
+        folder is removed afterwards
     :param n_epochs: Allocator epochs (the paper's E)
     :param n_pretraining_epochs: Router epochs of pre-training (E_p)
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
@@ -288,6 +289,7 @@ class ITSCallback(BaseCallback):
                 )
             if self.warm_start is not None and not self._warm_started:
                 self._start_router(self.warm_start)
+            self._warm_started = True
             self._started = True
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
         self._instances_before = self.epoch * self.instances_per_epoch
@@ -352,15 +354,17 @@ class ITSCallback(BaseCallback):
             if self.verbose > 0:
                 print(text, flush=True)
 
-        folder = self._warm_start_folder()
         positional = (self.router.policy, self.model.policy, self.problem.generator, rng)
-        signature = inspect.signature(function)
+        folder = None if self.save_path is None else self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
         offered = {"report": report, "folder": folder}
-        known = {name: value for name, value in offered.items() if name in signature.parameters}
         try:
-            call = signature.bind(*positional, **known, **(arguments or {}))
+            signature = inspect.signature(function)
+            known = {name: value for name, value in offered.items() if name in signature.parameters}
+            call = signature.bind(*positional, **{**known, **(arguments or {})})
         except TypeError as error:
             raise ValueError(f"warm_start: these arguments do not fit {path}: {error}") from error
+        if folder is not None:
+            self._bring_progress(folder)
         # From here on an interrupted run can go on.
         self._save_checkpoint()
         with undisturbed_random_state():
@@ -370,16 +374,19 @@ class ITSCallback(BaseCallback):
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def _warm_start_folder(self) -> Path | None:
-        """Where the warm start keeps its progress; that of the checkpoint which this run goes on from is copied there."""
-        if self.save_path is None:
-            return None
-        folder = self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
-        if self.resume_from is not None:
-            earlier = self.resume_from / WARM_START_FOLDER
-            if earlier.is_dir() and earlier.resolve() != folder.resolve():
-                shutil.copytree(earlier, folder, dirs_exist_ok=True)
-        return folder
+    def _bring_progress(self, folder: Path) -> None:
+        """
+        Leave no progress in the folder but that of the checkpoint which this run goes on from.
+
+        :param folder: Where the warm start is going to look for it
+        """
+        earlier = None if self.resume_from is None else self.resume_from / WARM_START_FOLDER
+        if earlier is not None and earlier.resolve() == folder.resolve():
+            return
+        if folder.is_dir():
+            shutil.rmtree(folder)
+        if earlier is not None and earlier.is_dir():
+            shutil.copytree(earlier, folder)
 
     @property
     def _router_policy(self) -> BasePolicy:
@@ -617,14 +624,16 @@ class ITSCallback(BaseCallback):
             return
         folder = self.save_path / CHECKPOINT_FOLDER
         setattr(self.model, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": self.epoch})
-        names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{self._n_router_epochs()}.zip"}
+        # Another name before the warm start, because a zip that the state file names must not change.
+        number = str(self._n_router_epochs()) if self._warm_started else "start"
+        names = {"allocator": f"allocator_{self.epoch}.zip", "router": f"router_{number}.zip"}
         save_atomically(self.model, folder / names["allocator"])
         save_atomically(self.router, folder / names["router"])
         records = [asdict(record) for record in self.records]
         state = {"epoch": self.epoch, **names, "warm_started": self._warm_started, "records": records}
         write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
         for old in folder.iterdir():
-            if re.fullmatch(r"(allocator|router)_\d+\.zip", old.name) and old.name not in names.values():
+            if re.fullmatch(r"(allocator|router)_(\d+|start)\.zip", old.name) and old.name not in names.values():
                 old.unlink()
 
     def _resume(self, folder: Path) -> None:
@@ -641,7 +650,9 @@ class ITSCallback(BaseCallback):
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         # As rl_zoo3 does with the allocator: the settings are those of now, the networks those of the zip.
-        settings = {key: value for key, value in self.router_kwargs.items() if key not in ROUTER_NETWORK}
+        given = self.router_kwargs.keys() - NOT_RELOADED
+        # From the new router, as its constructor may have changed them.
+        settings = {key: getattr(self.router, key) for key in given if hasattr(self.router, key)}
         try:
             with undisturbed_random_state():
                 loaded = type(self.router).load(
@@ -668,7 +679,8 @@ class ITSCallback(BaseCallback):
 def read_state(folder: Path) -> dict[str, Any]:
     """
     :param folder: A checkpoint of :class:`ITSCallback`
-    :return: What its state file says: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``
+    :return: What its state file says: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``, and, unless an
+        older version wrote it, ``warm_started``
     :raises FileNotFoundError: If there is none
     :raises ValueError: If it is damaged
     """
