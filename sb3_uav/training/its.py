@@ -646,7 +646,7 @@ class ITSCallback(BaseCallback):
                 f"train the allocator of {folder / state['allocator']}."
             )
         self.epoch = state["epoch"]
-        # Until version 0.1.0 the first checkpoint was written after the warm start.
+        # Without it, the state was written when there was no checkpoint before the end of the warm start.
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         # As rl_zoo3 does with the allocator: the settings are those of now, the networks those of the zip.
