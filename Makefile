@@ -6,7 +6,7 @@ PYTEST_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-LINT_PATHS := sb3_uav tests benchmarks examples
+LINT_PATHS := sb3_uav tests benchmarks examples scripts
 # Some are about results, not speed: they take arguments and an hour.
 NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py)
 BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard benchmarks/*.py)))
@@ -25,7 +25,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	touch $@
 
 demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)
-	$(BIN)/python -m sb3_uav.zoo.demo --out demo
+	$(BIN)/sb3-uav demo --out demo
 
 # One process per core, and one thread in each: threads that wait for a busy core cost more than they bring.
 test: $(INSTALLED)  ## Run the whole test suite

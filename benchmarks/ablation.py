@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import ABLATION_SEED
 from sb3_uav.envs import BatchedVecEnv, Instances, TaskAllocationEnv, UniformGenerator
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers.dl_drl import DLDRL
@@ -108,7 +109,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="CSV file")
     args = parser.parse_args()
     th.set_num_threads(args.num_threads)
-    test = UniformGenerator(args.n_tasks, args.n_uavs)(args.n_test_instances, np.random.default_rng(40_000_001))
+    test = UniformGenerator(args.n_tasks, args.n_uavs)(args.n_test_instances, np.random.default_rng(ABLATION_SEED))
     done: set[tuple[str, int]] = set()
     if args.out.is_file():
         with args.out.open(newline="", encoding="utf-8") as file:

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_uav.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
-from sb3_uav.solvers.comparison import confidence_halfwidth
+from sb3_uav.common.statistics import confidence_halfwidth
+from sb3_uav.studies.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
 
 REFERENCE = "ortools"
 
@@ -75,7 +75,7 @@ def ratio(ours: Mapping[tuple[str, int], float], reference: Mapping[tuple[str, i
         return np.nan, np.nan, 0
     difference = np.array([ours[place] - reference[place] for place in places])
     mean = float(np.mean([reference[place] for place in places]))
-    return 1.0 + float(difference.mean()) / mean, confidence_halfwidth(difference) / mean, len(places)
+    return 1.0 + float(difference.mean()) / mean, float(confidence_halfwidth(difference)) / mean, len(places)
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ import torch as th
 
 from sb3_uav.envs import Instances, check_schedule
 from sb3_uav.solvers import make_solver
-from sb3_uav.solvers.refinement import polish
+from sb3_uav.solvers.postprocess import polish
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained import files
 from sb3_uav.solvers import make_solver
-from sb3_uav.solvers.imitation import good_tours
+from sb3_uav.training.imitation import good_tours
 
 REPEATS = 5
 

@@ -464,7 +464,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     rows = [row for level in args.level for row in compete(level, args)]
     if args.out is not None:
-        from sb3_uav.training.common import write_atomically
+        from sb3_uav.common.files import write_atomically
 
         write_atomically(args.out, to_csv(rows))
 

@@ -10,12 +10,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from sb3_uav.cli import main as cli
 from sb3_uav.envs import Instances, Schedule, UniformGenerator
+from sb3_uav.evaluation.results import FAILED, OK, ResultRow, read_results
+from sb3_uav.evaluation.run import evaluate
 from sb3_uav.plots import anytime, plot_anytime
 from sb3_uav.plots.anytime import anytime_panels
-from sb3_uav.solvers import Solver, SolverResult, evaluate
-from sb3_uav.solvers.results import FAILED, OK, ResultRow, read_results
-from sb3_uav.zoo import cli
+from sb3_uav.solvers import Solver, SolverResult
 
 
 class Timed(Solver):

@@ -18,12 +18,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
+from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.solvers import Solver, SolverResult, limits, make_solver, milp, ortools_routing, pyvrp_search
 from sb3_uav.solvers.limits import UnavailableError
 from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
 from sb3_uav.solvers.programs import FREE_LICENCE_SIZE, Answer, Backend
 from sb3_uav.solvers.pyvrp_search import polish_schedule
-from sb3_uav.solvers.reduction import RESOLUTION, ReducedInstance
 
 # PyVRP 0.14 needs Python 3.11.
 HAS_PYVRP = find_spec("pyvrp") is not None

@@ -19,18 +19,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, TaskAllocationEnv, UniformGenerator
-from sb3_uav.plots.comparison import Band, BandPanel, plot_bands, visible_range
+from sb3_uav.plots.bands import Band, BandPanel, plot_bands, visible_range
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.training import fixed_set
 from sb3_uav.training.fixed_set import EvaluationHistory, FixedSetResult
 
 pytest.importorskip("rl_zoo3")
-from sb3_uav.zoo import cli, compare
-from sb3_uav.zoo.compare_report import Run, compute_band, compute_table, csv_text, estimate, half_width, interpolate
-from sb3_uav.zoo.pretraining import DividedSubsets, pretrain_router
-from sb3_uav.zoo.trainings import Training, run_trainings
-from sb3_uav.zoo.variants import callback_name, callbacks_of, read_variants, router_settings
+from sb3_uav.cli import main as cli
+from sb3_uav.common.statistics import confidence_halfwidth
+from sb3_uav.studies.compare import study as compare
+from sb3_uav.studies.compare.fixed_router import DividedSubsets, pretrain_router
+from sb3_uav.studies.compare.report import Run, compute_band, compute_table, csv_text, estimate, interpolate
+from sb3_uav.studies.compare.runs import Training, run_trainings
+from sb3_uav.studies.compare.variants import callback_name, callbacks_of, read_variants, router_settings
 
 ALLOCATION, ROUTING = "TaskAllocation-U3-N20-v0", "RoutePlanning-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
@@ -90,7 +92,7 @@ def test_student_intervals_agree_with_tables():
     """Quantiles 2.262 (9 degrees of freedom), 2.228 (10) and 2.042 (30)."""
     for n, quantile in ((10, 2.262), (11, 2.228), (31, 2.042)):
         values = np.arange(float(n))
-        assert half_width(values) == pytest.approx(quantile * values.std(ddof=1) / n**0.5, rel=1e-3)
+        assert confidence_halfwidth(values) == pytest.approx(quantile * values.std(ddof=1) / n**0.5, rel=1e-3)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=8), st.floats(-1.0, 9.0))

@@ -13,16 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_uav.solvers.comparison import (
-    SUMMARY_COLUMNS,
-    confidence_halfwidth,
-    gaps,
-    optimality_gap,
-    summarise,
-    write_summary,
-)
-from sb3_uav.solvers.results import FAILED, INFEASIBLE, OK, ResultRow
-from sb3_uav.solvers.tables import print_table
+from sb3_uav.common.statistics import confidence_halfwidth
+from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, ResultRow
+from sb3_uav.evaluation.summary import SUMMARY_COLUMNS, gaps, optimality_gap, summarise, write_summary
+from sb3_uav.evaluation.table import print_table
 
 
 def make_rows(solver: str, objectives: list[float | None], bounds: list[float | None] | None = None) -> list[ResultRow]:

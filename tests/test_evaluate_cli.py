@@ -18,14 +18,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from test_evaluation import Stub
 
 import sb3_uav
+from sb3_uav.cli import main as cli
+from sb3_uav.common.files import file_hash
 from sb3_uav.envs import BatchedVecEnv, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
+from sb3_uav.evaluation.results import RESULT_COLUMNS
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import SOLVERS, SolverResult
 from sb3_uav.solvers.limits import deadline_after
-from sb3_uav.solvers.results import RESULT_COLUMNS, file_hash
-from sb3_uav.zoo import cli
 
 TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 
@@ -534,7 +535,7 @@ def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsy
 
 def test_as_a_process(inputs: Inputs, tmp_path: Path) -> None:
     """What a shell sees: a table on the standard output, remarks on the standard error, the exit code."""
-    command = [sys.executable, "-m", "sb3_uav.zoo.cli", "evaluate", "--instances", str(inputs.small), "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "sb3_uav.cli.main", "evaluate", "--instances", str(inputs.small), "--out", str(tmp_path)]
     done = subprocess.run([*command, "--solvers", "random-nearest"], capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr.endswith("random-nearest on U3-N20: 4 instances\n")
     assert "random-nearest" in done.stdout

@@ -19,12 +19,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sb3_uav.common.files import file_hash
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
-from sb3_uav.solvers import OneByOneSolver, Solution, Solver, SolverResult, SummaryRow, evaluate, make_solver, results
-from sb3_uav.solvers.evaluation import find_reference
-from sb3_uav.solvers.results import RESULT_COLUMNS, file_hash, instances_hash, locked_folder
-from sb3_uav.solvers.running import Failure, Runner
+from sb3_uav.evaluation import results
+from sb3_uav.evaluation.parallel import Failure, Runner
+from sb3_uav.evaluation.results import RESULT_COLUMNS, instances_hash, locked_folder
+from sb3_uav.evaluation.run import evaluate, find_reference
+from sb3_uav.evaluation.summary import SummaryRow
+from sb3_uav.solvers import OneByOneSolver, Solution, Solver, SolverResult, make_solver
 
 
 class Stub(Solver):

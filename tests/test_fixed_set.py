@@ -289,7 +289,7 @@ def test_failing_disk_leaves_the_older_files(tmp_path, monkeypatch):
     def fail(*args):
         raise OSError("No space left on device")
 
-    for module in ("sb3_uav.training.common.os.replace", "sb3_uav.reinforce.saving.os.replace"):
+    for module in ("sb3_uav.common.files.os.replace",):
         monkeypatch.setattr(module, fail)
     with pytest.raises(OSError, match="No space"):
         make_model(PPO).learn(ROLLOUT, callback=make_callback(tmp_path, best_by="sampled"))

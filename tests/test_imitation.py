@@ -20,10 +20,10 @@ from sb3_uav.training import ITSCallback
 from sb3_uav.training.its import CHECKPOINT_FOLDER, WARM_START_FOLDER, read_state
 
 pytest.importorskip("numba")
-from sb3_uav.solvers import imitation
-from sb3_uav.solvers.imitation import Lesson, good_tours, imitate, search_lessons, varied
+from sb3_uav.training import imitation
+from sb3_uav.training.imitation import Lesson, good_tours, imitate, search_lessons, varied
 
-WARM_START = {"sb3_uav.solvers.imitation.imitate": {"n_subsets": 40, "n_updates": 4, "batch_size": 8}}
+WARM_START = {"sb3_uav.training.imitation.imitate": {"n_subsets": 40, "n_updates": 4, "batch_size": 8}}
 
 
 @pytest.fixture(scope="module")
@@ -251,8 +251,8 @@ def zero_router(router: Any, allocator: Any, generator: Any, rng: np.random.Gene
     [
         ({}, "warm_start must map the dotted path of one function to its arguments"),
         ({"sb3_uav.nothing.at_all": {}}, "warm_start is 'sb3_uav.nothing.at_all', which cannot be imported"),
-        ({"sb3_uav.solvers.imitation.WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
-        ({"sb3_uav.solvers.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),
+        ({"sb3_uav.training.imitation.WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
+        ({"sb3_uav.training.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),
     ],
 )
 def test_wrong_warm_starts(warm_start: Any, message: str) -> None:

@@ -19,9 +19,11 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import ClusteredGenerator, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import InfeasibleScheduleError
-from sb3_uav.solvers import base, kernels, kmeans_vnd, local_search, make_solver
+from sb3_uav.local_search import kernels
+from sb3_uav.local_search import search as local_search
+from sb3_uav.local_search.search import LocalSearch, improve, repair, repair_best
+from sb3_uav.solvers import base, kmeans_vnd, make_solver
 from sb3_uav.solvers.heuristics import kmeans
-from sb3_uav.solvers.local_search import LocalSearch, improve, repair, repair_best
 
 
 def random_schedule(instance: Instances, seed: int) -> Schedule:
@@ -358,7 +360,8 @@ def test_warm_up() -> None:
     """K-means+VND loads nothing more after it."""
     code = """
 from sb3_uav.envs import UniformGenerator
-from sb3_uav.solvers import kernels, make_solver
+from sb3_uav.local_search import kernels
+from sb3_uav.solvers import make_solver
 import numpy as np
 
 def signatures():

@@ -127,7 +127,7 @@ def test_nothing_is_half_written(instances: Instances, tmp_path: Path, monkeypat
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sb3_uav.plots.figures.os.replace", interrupted)
+    monkeypatch.setattr("sb3_uav.common.files.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         plot_schedule(instances, 0, Schedule([[1]]), path)
     assert only_file_in(tmp_path) == path and path.read_bytes() == before

@@ -17,9 +17,9 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import make_solver
-from sb3_uav.solvers.batched import parameters_hash
 from sb3_uav.solvers.dl_drl import load_dl_drl
-from sb3_uav.zoo import release
+from sb3_uav.solvers.network_solver import parameters_hash
+from scripts import release
 
 NAMES = pretrained.names()
 

@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from test_solvers import make_pair, objectives, routes
 
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
+from sb3_uav.evaluation.run import evaluate
 from sb3_uav.solvers import make_solver
 from sb3_uav.solvers.dl_drl import Block, Shortlists
-from sb3_uav.solvers.evaluation import evaluate
-from sb3_uav.solvers.refinement import Refinement, polish
+from sb3_uav.solvers.postprocess import Refinement, polish
 
 pytest.importorskip("numba")
 
@@ -79,7 +79,7 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
 
     clock.now = 0.0  # type: ignore[attr-defined]
     monkeypatch.setattr(pair, "_look", counting)
-    monkeypatch.setattr("sb3_uav.solvers.refinement.polish", noting)
+    monkeypatch.setattr("sb3_uav.solvers.postprocess.polish", noting)
     monkeypatch.setattr(time, "perf_counter", clock)
     pair.solve(instances, time_limit=0.5)
     some = sum(drawn)
@@ -161,7 +161,7 @@ def test_every_instance_has_its_share_of_the_time(instances: Instances, monkeypa
         given_seconds.append(seconds)
         return candidates[0]
 
-    monkeypatch.setattr("sb3_uav.solvers.local_search.repair_best", noting)
+    monkeypatch.setattr("sb3_uav.local_search.search.repair_best", noting)
     refinement = Refinement(repair=True)
     refinement(instances, [[Schedule([])]] * len(instances), time.perf_counter() + 8.0)
     assert len(given_seconds) == 4 and all(1.5 < seconds <= 2.0 for seconds in given_seconds)

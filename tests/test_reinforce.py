@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
+from sb3_uav.common.statistics import significantly_positive, student_t_quantile
 from sb3_uav.envs import (
     BatchedVecEnv,
     RoutePlanningEnv,
@@ -25,7 +26,6 @@ from sb3_uav.envs import (
 )
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.reinforce.baselines import significantly_positive, student_t_quantile
 
 SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 BASELINES = ("none", "exponential", "shared", "critic", "rollout")

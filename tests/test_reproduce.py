@@ -20,11 +20,15 @@ import pytest
 import torch as th
 from PIL import Image
 
+from sb3_uav.cli import main as cli
+from sb3_uav.evaluation.summary import gaps
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.reproduce import command
-from sb3_uav.reproduce.evaluations import Evaluator
-from sb3_uav.reproduce.models import ITS, Model, Models, _train_in_process, _Training, run_trainings
-from sb3_uav.reproduce.paper import (
+from sb3_uav.studies.reproduce import command
+from sb3_uav.studies.reproduce.figures import read_curves
+from sb3_uav.studies.reproduce.measurements import Evaluator
+from sb3_uav.studies.reproduce.pair_training import Job, TrainingError, train, training_entry
+from sb3_uav.studies.reproduce.pairs import ITS, Model, Models, _train_in_process, _Training, run_trainings
+from sb3_uav.studies.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
     LARGER_METHODS,
@@ -35,13 +39,9 @@ from sb3_uav.reproduce.paper import (
     paper_figure,
     paper_tables,
 )
-from sb3_uav.reproduce.result_figures import read_curves
-from sb3_uav.reproduce.result_tables import phase_times, seconds
-from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
-from sb3_uav.reproduce.tables import Column, Table, best, to_csv, to_latex, to_markdown
-from sb3_uav.reproduce.training import Job, TrainingError, train, training_entry
-from sb3_uav.solvers.comparison import gaps
-from sb3_uav.zoo import cli
+from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
+from sb3_uav.studies.reproduce.table_files import Column, Table, best, to_csv, to_latex, to_markdown
+from sb3_uav.studies.reproduce.tables import phase_times, seconds
 
 pytest.importorskip("rl_zoo3")
 
@@ -486,7 +486,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def no_licence(spec: str, **_: Any) -> Any:
         raise ValueError(f"{spec}: no licence")
 
-    monkeypatch.setattr("sb3_uav.reproduce.evaluations.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.studies.reproduce.measurements.make_solver", no_licence)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")

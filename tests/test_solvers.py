@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from sb3_uav.envs import ClusteredGenerator, InstanceGenerator, Instances, UniformGenerator, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy, memory
 from sb3_uav.solvers import DLDRL, SOLVERS, KMeansAM, Solver, dl_drl, make_solver
-from sb3_uav.solvers.batched import parameters_hash
 from sb3_uav.solvers.heuristics import KMeansNearest, kmeans
+from sb3_uav.solvers.network_solver import parameters_hash
 
 TINY = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 HEURISTICS = ("kmeans-nearest", "random-nearest")

@@ -13,6 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch as th
 
+from sb3_uav.common.files import temporary_name
+
 # One tolerance for the dynamics and for the checker, relative to the maximum flight distance.
 DISTANCE_TOLERANCE = 5e-10
 
@@ -277,16 +279,12 @@ class Instances:
         """
         path = Path(path)
         path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        temporary = path.with_name(path.name + ".tmp.npz")
         arrays = {name: getattr(self, name).double().cpu().numpy() for name in ("depot", "tasks", "values", "max_distance")}
         arrays["n_uavs"] = np.full(self.batch_size, self.n_uavs)
         if not self.task_mask.all():
             arrays["task_mask"] = self.task_mask.cpu().numpy()
-        try:
+        with temporary_name(path) as temporary:
             np.savez_compressed(temporary, **arrays)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Instances:

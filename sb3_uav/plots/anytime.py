@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.envs.render import UAV_COLOURS, require_matplotlib
+from sb3_uav.evaluation.results import OK, RESULTS_FILE, ResultRow, read_results
 from sb3_uav.plots.figures import checked_path, new_figure, save_figure
-from sb3_uav.solvers.comparison import confidence_halfwidth
-from sb3_uav.solvers.results import OK, RESULTS_FILE, ResultRow, read_results
 
 PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -67,7 +67,7 @@ def plot_anytime(
     Bands and bars are 95 % confidence intervals over the instances of what is missing to the best objective that any solver
     found on the same instance: that some instances allow more than others says nothing about solvers.
 
-    :param results: Folder that :func:`~sb3_uav.solvers.evaluation.evaluate` wrote
+    :param results: Folder that :func:`~sb3_uav.evaluation.run.evaluate` wrote
     :param paths: The ``.png``, ``.pdf`` or ``.svg`` to write, or several
     :param solvers: Names of the solvers to draw; all when None
     :return: The paths

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sb3_uav.common.files import temporary_name
 from sb3_uav.envs.render import require_matplotlib
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -42,12 +43,7 @@ def save_figure(figure: Any, path: Path, metadata: Mapping[str, str] | None = No
     :param path: From :func:`checked_path`; its folder is created if missing
     :param metadata: Written into the file, under keys that its format has
     """
-    temporary = path.with_name(path.name + ".tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with temporary_name(path) as temporary:
         # Legends below a map lie outside its axes, which the layout does not always leave room for.
         kind = path.suffix[1:].lower()
         figure.savefig(temporary, format=kind, dpi=150, bbox_inches="tight", pad_inches=0.12, metadata=metadata)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from copy import deepcopy
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import HELD_OUT_STREAM, random_stream
+from sb3_uav.common.statistics import significantly_positive
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.reinforce.streams import HELD_OUT_STREAM, random_stream
 
 if TYPE_CHECKING:
     from sb3_uav.reinforce.reinforce import REINFORCE
@@ -193,41 +192,6 @@ def greedy_returns(policy: Any, problem: Problem, instances: Instances) -> th.Te
     returns = problem.returns(instances, policy.decode_episodes(instances))
     policy.set_training_mode(was_training)
     return returns
-
-
-def significantly_positive(gain: np.ndarray, alpha: float) -> bool:
-    """
-    One-sided paired t-test.
-
-    :param gain: ``(n,)`` paired differences
-    :param alpha: Significance level
-    :return: Whether their mean is significantly above 0
-    """
-    n = len(gain)
-    mean, deviation = float(gain.mean()), float(gain.std(ddof=1))
-    if deviation == 0.0:
-        return mean > 0.0
-    return mean / (deviation / math.sqrt(n)) > student_t_quantile(1 - alpha, n - 1)
-
-
-def student_t_quantile(probability: float, degrees: int) -> float:
-    """
-    Quantile of Student's t distribution by the Cornish-Fisher expansion around the normal one.
-
-    Torch and numpy have no such function, and scipy is not a dependency of the core. Off by less than 0.001 at the usual
-    significance levels from 10 degrees of freedom on (Abramowitz and Stegun, 26.7.5).
-
-    :param probability: Between 0 and 1
-    :param degrees: Degrees of freedom
-    """
-    z = NormalDist().inv_cdf(probability)
-    terms = (
-        z,
-        (z**3 + z) / (4 * degrees),
-        (5 * z**5 + 16 * z**3 + 3 * z) / (96 * degrees**2),
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * degrees**3),
-    )
-    return sum(terms)
 
 
 BASELINES: dict[str, type[Baseline]] = {

@@ -26,14 +26,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
+from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.instances import Instances, training_batch
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.base import Cache
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
-from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.reinforce.streams import ACTION_STREAM, TRAINING_STREAM, random_stream
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
 

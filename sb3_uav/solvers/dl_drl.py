@@ -19,9 +19,9 @@ from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained import pair_files
-from sb3_uav.solvers.batched import BatchedSolver, parameters_hash
 from sb3_uav.solvers.limits import deadline_after
-from sb3_uav.solvers.refinement import Refinement
+from sb3_uav.solvers.network_solver import BatchedSolver, parameters_hash
+from sb3_uav.solvers.postprocess import Refinement
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
@@ -71,8 +71,8 @@ class DLDRL(BatchedSolver):
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: How tables and files call it; says what it does when None
-    :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.solvers.local_search.repair`
-    :param polish: For how many seconds per instance to go on from the best, see :func:`~sb3_uav.solvers.refinement.polish`
+    :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.local_search.search.repair`
+    :param polish: For how many seconds per instance to go on from the best, see :func:`~sb3_uav.solvers.postprocess.polish`
     :param time_limit: Seconds per instance in all, on average over a batch, when :meth:`solve` is given none: a part of them
         limits the number of samples, the rest is for repair and polish
     :raises ImportError: If numba is needed and not installed

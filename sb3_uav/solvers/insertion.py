@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.reduction import ReducedInstance
 
 # Insertions that add no length are all equally good, whatever rounding makes of their lengths; the value decides among them.
 SMALLEST_DETOUR = 1e-12

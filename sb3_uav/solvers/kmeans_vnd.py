@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 
+from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
 from sb3_uav.solvers.heuristics import checked_restarts, kmeans, nearest_feasible_schedule
-from sb3_uav.solvers.limits import require
 
 
 class KMeansVND(OneByOneSolver):
@@ -32,7 +32,7 @@ class KMeansVND(OneByOneSolver):
 
     def __init__(self, restarts: int = 10) -> None:
         self.restarts = checked_restarts(restarts, self.name)
-        require("numba", self.name)
+        require("numba", f"Solver {self.name}", "solvers")
 
     def prepare(self) -> None:
         _warm_up()
@@ -46,7 +46,7 @@ class KMeansVND(OneByOneSolver):
 @cache
 def _warm_up() -> None:
     """Once in a process. Imported when needed, because numba may be missing and this class is told of even then."""
-    from sb3_uav.solvers.local_search import warm_up
+    from sb3_uav.local_search.search import warm_up
 
     warm_up()
 
@@ -61,7 +61,7 @@ def descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tu
     tasks = np.flatnonzero(mine)
     if len(tasks) == 0:
         return ()
-    from sb3_uav.solvers.local_search import LocalSearch
+    from sb3_uav.local_search.search import LocalSearch
 
     alone = replace(
         instance,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from importlib import import_module
-from types import ModuleType
 
 from sb3_uav.solvers.base import OneByOneSolver
 
@@ -49,17 +47,3 @@ class TimeLimitedSolver(OneByOneSolver):
         :raises TimeLimitError: If the limit is not a finite number above 0
         """
         return deadline_after(self.time_limit if time_limit is None else time_limit, self.name)
-
-
-def require(module: str, solver: str, extra: str = "solvers") -> ModuleType:
-    """
-    :param module: An optional module
-    :param solver: Name of the solver that needs it
-    :param extra: The extra of sb3-uav that brings it
-    :return: The imported module
-    :raises ImportError: With the command that installs it
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ImportError(f"Solver {solver} needs {module} ({error}); run: pip install 'sb3-uav[{extra}]'") from error

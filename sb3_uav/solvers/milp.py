@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.solvers.base import Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver
 from sb3_uav.solvers.programs import BACKENDS, Program, Rows
-from sb3_uav.solvers.reduction import ReducedInstance
 
 # Tasks nearer to each other than this, in units of the maximum flight distance, are one place.
 COINCIDENT = 1e-12

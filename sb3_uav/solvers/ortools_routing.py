@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.limits import TimeLimitedSolver, require
-from sb3_uav.solvers.reduction import RESOLUTION, ReducedInstance
+from sb3_uav.solvers.limits import TimeLimitedSolver
 
 # Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
 LARGEST_PRIZE = 1_000_000
@@ -70,7 +71,7 @@ def _require_routing(solver: str) -> Any:
     :return: The module ``ortools.constraint_solver.pywrapcp``
     :raises ImportError: If OR-Tools is not installed
     """
-    return require("ortools.constraint_solver.pywrapcp", solver)
+    return require("ortools.constraint_solver.pywrapcp", f"Solver {solver}", "solvers")
 
 
 def _solve(solver: str, instance: Instances, deadline: float | None = None) -> Schedule:

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_uav.solvers.limits import UnavailableError, require
+from sb3_uav.common.optional import require
+from sb3_uav.solvers.limits import UnavailableError
 
 # What the solvers are asked to keep to: in constraints, in integers, and between the best value and its bound.
 SOLVER_TOLERANCE = 1e-9
@@ -142,10 +143,10 @@ class HiGHSBackend(Backend):
     """
 
     def __init__(self) -> None:
-        require("highspy", "milp")
+        require("highspy", "Solver milp", "solvers")
 
     def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> Answer:
-        highspy: Any = require("highspy", "milp")
+        highspy: Any = require("highspy", "Solver milp", "solvers")
         model = highspy.HighsLp()
         model.sense_ = highspy.ObjSense.kMaximize
         model.num_col_, model.num_row_ = len(program.objective), len(program.lower)
@@ -208,7 +209,7 @@ class GurobiBackend(Backend):
         """
         :return: The module ``gurobipy``, and a new environment
         """
-        gurobipy: Any = require("gurobipy", "milp:backend=gurobi", "gurobi")
+        gurobipy: Any = require("gurobipy", "Solver milp:backend=gurobi", "gurobi")
         try:
             return gurobipy, gurobipy.Env(params={"OutputFlag": 0})
         except gurobipy.GurobiError as error:

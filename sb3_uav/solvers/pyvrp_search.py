@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import Solution
-from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after, require
-from sb3_uav.solvers.reduction import RESOLUTION, ReducedInstance
+from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after
 
 # Its interface changes with every minor version.
 SUPPORTED_VERSION = "0.14."
@@ -88,7 +89,7 @@ def _require_pyvrp(solver: str) -> Any:
     :return: The module ``pyvrp``
     :raises ImportError: If it is not installed, or not in a supported version
     """
-    pyvrp = require("pyvrp", solver)
+    pyvrp = require("pyvrp", f"Solver {solver}", "solvers")
     found = version("pyvrp")
     if not found.startswith(SUPPORTED_VERSION):
         raise ImportError(

@@ -16,14 +16,15 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
+from sb3_uav.common.files import write_atomically
+from sb3_uav.common.random_streams import FIXED_SET_ACTION_STREAM, FIXED_SET_STREAM, random_stream
+from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.instances import UNREADABLE, Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.reinforce.streams import FIXED_SET_ACTION_STREAM, FIXED_SET_STREAM, random_stream
-from sb3_uav.training.common import find_run_folder, siblings, write_atomically
+from sb3_uav.training.common import find_run_folder, siblings
 from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
 
 RESULTS_FILE = "evaluations.npz"

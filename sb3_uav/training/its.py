@@ -25,6 +25,9 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_uav.common.files import write_atomically
+from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
+from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.instances import training_batch
 from sb3_uav.envs.routing import RoutePlanningEnv
@@ -32,16 +35,7 @@ from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.reinforce import find_problem
-from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.reinforce.streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
-from sb3_uav.training.common import (
-    CallbackT,
-    find_run_folder,
-    hand_over_router,
-    siblings,
-    undisturbed_random_state,
-    write_atomically,
-)
+from sb3_uav.training.common import CallbackT, find_run_folder, hand_over_router, siblings, undisturbed_random_state
 from sb3_uav.training.episode_buffer import use_episode_buffer
 from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
@@ -166,8 +160,8 @@ class ITSCallback(BaseCallback):
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
     :param warm_start: What gives the router a start before anything else, by its dotted path, and its arguments, as in
-        ``{"sb3_uav.solvers.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
-        the generator of the instances and a random generator, see :func:`~sb3_uav.solvers.imitation.imitate`. If it has the
+        ``{"sb3_uav.training.imitation.imitate": {"n_updates": 1000}}``: a function of the policies of router and allocator,
+        the generator of the instances and a random generator, see :func:`~sb3_uav.training.imitation.imitate`. If it has the
         arguments ``report`` and ``folder``, it gets a function to tell its progress to, and a folder to keep it in (None
         without ``save_path``), so that a run that goes on from the checkpoint of before its end can go on with it; the
         folder is removed afterwards

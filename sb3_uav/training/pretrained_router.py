@@ -7,10 +7,11 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common.files import write_atomically
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.training.common import find_run_folder, hand_over_router, siblings, undisturbed_random_state, write_atomically
+from sb3_uav.training.common import find_run_folder, hand_over_router, siblings, undisturbed_random_state
 from sb3_uav.training.fixed_set import evaluated_problem
 from sb3_uav.training.its import ITSCallback
 

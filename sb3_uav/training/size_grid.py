@@ -13,18 +13,18 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common.files import write_atomically
+from sb3_uav.common.random_streams import GRID_SEED
+from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.allocation import AllocationProblem, plan_tours
 from sb3_uav.envs.instances import Instances, UniformGenerator
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce.reinforce import find_problem
-from sb3_uav.reinforce.saving import save_atomically
-from sb3_uav.training.common import siblings, write_atomically
+from sb3_uav.training.common import siblings
 from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
 
 # UAVs, tasks, instances.
 DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
-# Far from every stream of the training.
-GRID_SEED = 30_000_001
 GRID_FILE, BEST_ALLOCATOR_FILE = "size_grid.csv", "best_allocator.zip"
 
 

@@ -27,6 +27,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_uav
+from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
@@ -34,8 +35,6 @@ from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
-# Added to the seed of the training environments, whose rows take the seeds that follow it.
-EVALUATION_SEED = 1_000_003
 # What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
 ZOO_KEYS = {
     "n_envs",

@@ -1,0 +1,228 @@
+"""``sb3-uav evaluate``: zips and solvers side by side, on the same instances."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_uav.envs import Instances
+    from sb3_uav.solvers import Solver
+
+OK, INFEASIBLE, USER_ERROR, FAILED = 0, 1, 2, 3
+EPILOG = """\
+solvers:
+  An unknown NAME makes the error message list all solvers, an unknown KEY all options of that solver.
+  NAME:KEY=VALUE,... sets options of a solver; name=TEXT is how tables and files call it. Trained zips are solvers too:
+    dl-drl:allocator=A.zip,router=R.zip,decode=sampling,samples=128      a trained pair
+    dl-drl-i:allocator=A.zip,router=R.zip                                the same, named as in the paper (independent training)
+    kmeans-am:router=R.zip                                               K-means and a trained router
+
+files in DIR:
+  results.csv, schedules.jsonl    one line per solver and instance, written as soon as it is known
+  summary.csv, summary.json       the table, with more columns
+  evaluation.json                 solvers, hashes of instances and zips, seeds, versions of packages
+  The same call goes on where an interrupted one stopped, and further calls add solvers, time limits and seeds.
+
+exit code:
+  0    all schedules are feasible
+  1    a schedule was infeasible, or a solver proved a bound that is wrong
+  2    the input was wrong, and nothing was run
+  3    a solver or its licence is missing, or it refused the instances or its time limit, or failed; others are complete
+  130  interrupted by Ctrl-C
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sb3-uav evaluate",
+        description="Evaluate trained pairs and other solvers on the same instances. Every schedule is checked\n"
+        "by the same independent code, and solvers are compared instance by instance.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--instances", type=Path, nargs="+", required=True, metavar="NPZ", help="instance files")
+    parser.add_argument(
+        "--solvers", nargs="+", default=[], metavar="NAME[:KEY=VALUE,...]", help="solvers, e.g. kmeans-nearest (see below)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        nargs="+",
+        metavar="SECONDS",
+        help="per instance, for solvers that use it; several run one after the other (default: each solver's own)",
+    )
+    parser.add_argument("--reference", metavar="NAME", help="solver that the others are compared with (default: the first)")
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="start anew, instead of going on with the results in DIR")
+    networks = parser.add_argument_group("networks")
+    networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
+    networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
+    pair = parser.add_argument_group("a trained pair, the first of the solvers")
+    pair.add_argument("--allocator", type=Path, metavar="ZIP", help="SB3 zip of the allocator (needs --router)")
+    pair.add_argument("--router", type=Path, metavar="ZIP", help="SB3 zip of the router (needs --allocator)")
+    pair.add_argument("--decode", choices=("greedy", "sampling"), default="greedy", help="default: %(default)s")
+    pair.add_argument("--samples", type=int, default=128, help="allocations per instance with sampling, default: %(default)s")
+    pair.add_argument("--untrained", action="store_true", help="add the same networks before any training")
+    return parser
+
+
+def load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
+    """
+    :param paths: The files
+    :return: Their instances by the stem of the file, or by the whole path where stems are alike
+    :raises FileNotFoundError: If a file is missing
+    :raises ValueError: If a file is damaged or given twice
+    """
+    from sb3_uav.envs import Instances
+
+    stems = [path.stem for path in paths]
+    names = [str(path) if stems.count(path.stem) > 1 else path.stem for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"--instances names {name} twice; give every file once.")
+    return {name: Instances.load(path) for name, path in zip(names, paths, strict=True)}
+
+
+def make_solvers(args: argparse.Namespace) -> list[Solver]:
+    """
+    :param args: Of ``sb3-uav evaluate``
+    :return: The solvers that they ask for, the trained pair first; in place of one whose package or licence is missing, or
+        whose time limit is 0, one that refuses all instances
+    :raises FileNotFoundError: If a zip is missing
+    :raises ValueError: If a zip is damaged, or another argument is not allowed
+    """
+    from sb3_uav.evaluation.run import UnavailableSolver
+    from sb3_uav.solvers.base import make_solver
+    from sb3_uav.solvers.limits import UnavailableError
+
+    if (args.allocator is None) != (args.router is None):
+        missing = "--allocator" if args.allocator is None else "--router"
+        raise ValueError(f"--allocator and --router go together; {missing} is missing.")
+    solvers: list[Solver] = []
+    if args.allocator is not None:
+        from sb3_uav.solvers.dl_drl import load_dl_drl
+
+        trained = load_dl_drl(args.allocator, args.router, args.decode, args.samples, args.device, args.batch_size)
+        solvers += [trained, trained.untrained(args.seed)] if args.untrained else [trained]
+    elif args.untrained:
+        raise ValueError("--untrained needs --allocator and --router, which say what the networks look like.")
+    for spec in args.solvers:
+        try:
+            solvers.append(make_solver(spec, device=args.device, batch_size=args.batch_size))
+        except (ImportError, UnavailableError) as error:
+            solvers.append(UnavailableSolver(spec, str(error)))
+    if not solvers:
+        raise ValueError("There is nothing to evaluate: give --allocator with --router, or --solvers.")
+    return solvers
+
+
+class ProgressLines:
+    """
+    One line for each solver and set of instances, and on a terminal a bar. Use it as a context manager.
+
+    :raises ImportError: If tqdm is needed and not installed
+    """
+
+    def __init__(self) -> None:
+        self._text = ""
+        self._bar: Any = None
+        self._make_bar: Any = None
+        if sys.stderr.isatty():
+            try:
+                from tqdm import tqdm
+            except ImportError as error:
+                raise ImportError("The progress bar needs tqdm; run: pip install 'sb3-uav[solvers]'") from error
+            self._make_bar = partial(tqdm, leave=False, unit="instance", dynamic_ncols=True)
+
+    def __enter__(self) -> ProgressLines:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, text: str, n_done: int, n_total: int) -> None:
+        """
+        :param text: What is being done
+        :param n_done: How much of it is done
+        :param n_total: How much there is to do
+        """
+        if text != self._text:
+            self._start(text, n_done, n_total)
+        elif self._bar is not None:
+            self._bar.update(n_done - self._bar.n)
+
+    def _start(self, text: str, n_done: int, n_total: int) -> None:
+        if self._bar is not None:
+            self._bar.close()
+        self._text = text
+        print(text, file=sys.stderr, flush=True)
+        if self._make_bar is not None:
+            self._bar = self._make_bar(initial=n_done, total=n_total)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: Arguments; those of the process when None
+    :return: Exit code, see :data:`EPILOG`
+    :raises ValueError: If an argument or a file is wrong
+    :raises OSError: If a file cannot be read or written
+    :raises ImportError: If a package that evaluations need is not installed
+    """
+    args = make_parser().parse_args(argv)
+    from sb3_uav.evaluation.run import evaluate, find_reference
+    from sb3_uav.evaluation.table import print_table, require_rich
+
+    # What may be missing or wrong is found before the long run, not after it.
+    require_rich()
+    instances = load_instances(args.instances)
+    for name, batch in instances.items():
+        n_real, n_reachable = int(batch.task_mask.sum()), int(batch.reachable().sum())
+        if n_reachable < n_real:
+            print(
+                f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks lie farther than max_distance / 2 from their "
+                "depot; no schedule can visit them.",
+                file=sys.stderr,
+            )
+    solvers = make_solvers(args)
+    reference = find_reference(solvers, args.reference)
+    try:
+        with ProgressLines() as progress:
+            summary = evaluate(
+                solvers,
+                instances,
+                args.out,
+                args.seed,
+                progress,
+                time_limits=args.time_limit or (None,),
+                n_jobs=args.jobs,
+                reference=reference,
+                resume=not args.overwrite,
+            )
+    except KeyboardInterrupt:
+        print(f"sb3-uav: {args.out} holds the results so far; the same command goes on from there.", file=sys.stderr)
+        raise
+    print_table(summary)
+    # A solver that uses no time limit stands in the summary of each.
+    violations = dict.fromkeys(violation for row in summary for violation in row.violations)
+    failures = dict.fromkeys(failure for row in summary for failure in row.failures)
+    for violation in violations:
+        print(f"sb3-uav: wrong: {violation}", file=sys.stderr)
+    for failure in failures:
+        print(f"sb3-uav: {failure}", file=sys.stderr)
+    if violations:
+        return INFEASIBLE
+    return FAILED if failures else OK

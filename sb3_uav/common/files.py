@@ -1,0 +1,81 @@
+"""Files that are whole at any moment, and their digests."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+
+@contextmanager
+def temporary_name(path: Path) -> Iterator[Path]:
+    """
+    Give a file another name while it is written, and rename it once the ``with`` block ends without an exception.
+
+    :param path: The file to write; its folder is created if missing
+    :return: The temporary path, in the same folder and with the same suffix
+    :raises OSError: If the file cannot be written; an older file of this name is then untouched
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.tmp{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """
+    :param path: The file to write; its folder is created if missing
+    :param content: The content of the file; text is encoded as UTF-8
+    :raises OSError: If the file cannot be written; an older file of this name is then untouched
+    """
+    with temporary_name(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def replaced_when_complete(path: Path) -> Iterator[TextIO]:
+    """
+    Open a text file for writing that replaces an older one only when the ``with`` block ends without an exception.
+
+    :param path: The file to write; its folder is created if missing
+    :return: The opened file, without translation of line ends
+    :raises ValueError: If the file cannot be opened there
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_name(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+            yield file
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror}); choose another output folder.") from error
+
+
+def write_csv(file: TextIO, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """
+    :param file: A file opened with ``newline=""``
+    :param columns: Cells of the first line
+    :param rows: Cells of the other lines; None becomes an empty cell
+    """
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+
+
+def file_hash(path: Path) -> str:
+    """
+    :param path: A file; ``.zip`` is appended if there is no such file, as SB3 does
+    :return: SHA-256 of the file in hexadecimal digits, as ``sha256sum`` prints it
+    :raises OSError: If the file cannot be read
+    """
+    path = path if path.is_file() else path.with_name(path.name + ".zip")
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,31 @@
+"""Random numbers by name instead of by state, so that a resumed run draws what an unbroken one would have drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Which numbers are drawn. The streams are disjoint, from each other and from generators that were seeded with a plain number.
+TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM, SUBSET_STREAM, FIXED_SET_STREAM, FIXED_SET_ACTION_STREAM = range(6)
+WARM_START_STREAM = 6
+
+# Seeds of what is not a part of training, far from the seeds that users give and from those that follow them.
+# Added to the seed of the training environments; the rows of the evaluation environment take the seeds that follow.
+EVALUATION_SEED = 1_000_003
+# Instances that solvers are tested on.
+TEST_SEED = 20_000_003
+# Instances of SizeGridCallback.
+GRID_SEED = 30_000_001
+# Instances of benchmarks/ablation.py.
+ABLATION_SEED = 40_000_001
+# What all runs of a comparison share: its validation set and the router that it trains.
+SHARED_SEED = 0
+
+
+def random_stream(seed: int, *key: int) -> np.random.Generator:
+    """
+    :param seed: The seed of a run
+    :param key: Stream and counters
+    :return: A generator that depends on nothing else
+    """
+    # Not default_rng([seed, *key]): trailing zeros would not count there, so that [0, 0] and 0 give the same numbers.
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

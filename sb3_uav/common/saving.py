@@ -1,0 +1,35 @@
+"""Saving algorithms so that an interruption or a full disk never costs the previous file."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from collections.abc import Iterable
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_uav.common.files import temporary_name
+
+
+def save_atomically(
+    model: BaseAlgorithm,
+    path: str | pathlib.Path | io.BufferedIOBase,
+    exclude: Iterable[str] | None = None,
+    include: Iterable[str] | None = None,
+) -> None:
+    """
+    SB3's ``save``, under a temporary name that is renamed when the zip is complete.
+
+    :param model: Any SB3 algorithm
+    :param path: The zip to write; ``.zip`` is appended when missing
+    :param exclude: Attributes to leave out
+    :param include: Attributes to save although they are left out by default
+    :raises OSError: If the file cannot be written; an older one of the same name is then untouched
+    """
+    if not isinstance(path, str | pathlib.Path):
+        BaseAlgorithm.save(model, path, exclude, include)
+        return
+    path = pathlib.Path(path)
+    path = path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
+    with temporary_name(path) as temporary:
+        BaseAlgorithm.save(model, temporary, exclude, include)

@@ -1,0 +1,70 @@
+"""Student's t distribution: quantiles, confidence intervals and the paired t-test."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+
+CONFIDENCE = 0.95
+# 97.5 % quantiles for 1 to 9 degrees of freedom as tables print them, where the expansion of student_t_quantile is not exact.
+FEW_DEGREES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+
+
+def student_t_quantile(probability: float, degrees: int) -> float:
+    """
+    Quantile of Student's t distribution by the Cornish-Fisher expansion around the normal one.
+
+    PyTorch and NumPy have no such function, and SciPy is not a dependency of the core. Off by less than 0.001 at the usual
+    significance levels from 10 degrees of freedom on (Abramowitz and Stegun, 26.7.5).
+
+    :param probability: Probability below the quantile, between 0 and 1
+    :param degrees: Degrees of freedom
+    :return: The quantile
+    """
+    z = NormalDist().inv_cdf(probability)
+    terms = (
+        z,
+        (z**3 + z) / (4 * degrees),
+        (5 * z**5 + 16 * z**3 + 3 * z) / (96 * degrees**2),
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * degrees**3),
+    )
+    return sum(terms)
+
+
+def confidence_quantile(degrees: int) -> float:
+    """
+    :param degrees: Degrees of freedom, at least 1
+    :return: The quantile of Student's t distribution for a two-sided interval of :data:`CONFIDENCE`
+    """
+    return FEW_DEGREES[degrees - 1] if degrees <= len(FEW_DEGREES) else student_t_quantile((1 + CONFIDENCE) / 2, degrees)
+
+
+def confidence_halfwidth(samples: np.ndarray) -> np.ndarray:
+    """
+    Half of the 95 % confidence interval of a mean: that of the paired t-test, if the samples are paired differences.
+
+    :param samples: ``(n, ...)``
+    :return: ``(...)``, ``t * s / sqrt(n)``, where t is the 97.5 % quantile of Student's t distribution with n - 1 degrees of
+        freedom and s the standard deviation over the first dimension; NaN with fewer than two samples
+    """
+    n = len(samples)
+    if n < 2:
+        return np.full(samples.shape[1:], np.nan)
+    return confidence_quantile(n - 1) * np.std(samples, axis=0, ddof=1) / math.sqrt(n)
+
+
+def significantly_positive(gain: np.ndarray, alpha: float) -> bool:
+    """
+    One-sided paired t-test.
+
+    :param gain: ``(n,)`` paired differences
+    :param alpha: Significance level
+    :return: Whether their mean is significantly above 0
+    """
+    n = len(gain)
+    mean, deviation = float(gain.mean()), float(gain.std(ddof=1))
+    if deviation == 0.0:
+        return mean > 0.0
+    return mean / (deviation / math.sqrt(n)) > student_t_quantile(1 - alpha, n - 1)

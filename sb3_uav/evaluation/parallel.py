@@ -1,0 +1,204 @@
+"""Running a solver on instances, in this process or in others, so that one that fails harms nothing else."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.evaluation.results import one_line
+from sb3_uav.solvers.base import OneByOneSolver, Solver, SolverResult
+
+# One that it solves, and one to go on with while the main process writes down the result.
+TASKS_PER_PROCESS = 2
+
+
+class Failure(NamedTuple):
+    """
+    :param message: What went wrong, in one line
+    """
+
+    message: str
+
+    @classmethod
+    def of(cls, error: Exception) -> Failure:
+        """
+        :param error: What a solver raised
+        """
+        text = one_line(error)
+        # Ours are whole sentences; of others the type is often the best part.
+        return cls(text if text and isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {text}")
+
+
+class Task(NamedTuple):
+    """
+    One instance for a worker. As numpy arrays, because torch would pass tensors on through shared memory.
+
+    :param solver: The solver
+    :param n_uavs: Number of UAVs
+    :param arrays: The other fields of :class:`Instances`, a batch of one
+    :param row: Index of the instance in its set
+    :param time_limit: Seconds
+    :param seed: Of the solver
+    """
+
+    solver: OneByOneSolver
+    n_uavs: int
+    arrays: dict[str, np.ndarray]
+    row: int
+    time_limit: float | None
+    seed: int
+
+    @classmethod
+    def of(cls, solver: OneByOneSolver, instances: Instances, row: int, time_limit: float | None, seed: int) -> Task:
+        fields = vars(instances[row])
+        arrays = {name: value.numpy() for name, value in fields.items() if isinstance(value, th.Tensor)}
+        return cls(solver, instances.n_uavs, arrays, row, time_limit, seed)
+
+    def run(self) -> SolverResult | Failure:
+        arrays = {name: th.from_numpy(value) for name, value in self.arrays.items()}
+        instance = Instances(n_uavs=self.n_uavs, **arrays)
+        return solve_row(self.solver, instance, self.row, self.time_limit, self.seed)
+
+
+def solve_row(
+    solver: OneByOneSolver, instance: Instances, row: int, time_limit: float | None, seed: int
+) -> SolverResult | Failure:
+    """
+    :param solver: The solver
+    :param instance: A batch of one
+    :param row: Its index in its set
+    :param time_limit: Seconds
+    :param seed: Of the solver
+    :return: What the solver found, or why it did not
+    """
+    try:
+        return solver.solve_row(instance, row, time_limit, seed)
+    except Exception as error:
+        # Solvers call packages that raise what they like; the evaluation of others must go on.
+        return Failure.of(error)
+
+
+def _start_worker() -> None:
+    """What a worker does first."""
+    th.set_num_threads(1)
+    # Ctrl-C reaches all processes of a terminal; the main one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Without this, workers of a main process that was killed would solve on, or wait for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+class Runner:
+    """
+    Runs solvers, :class:`OneByOneSolver` in parallel processes if there shall be more than one. Use it as a context manager.
+
+    :param n_jobs: Number of processes
+    :raises ValueError: If it is less than 1
+    """
+
+    def __init__(self, n_jobs: int = 1) -> None:
+        if n_jobs < 1:
+            raise ValueError(f"The number of jobs is {n_jobs}; give at least 1.")
+        self.n_jobs = n_jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Runner:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_pool()
+
+    def run(
+        self, solver: Solver, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
+    ) -> Iterator[tuple[int, SolverResult | Failure]]:
+        """
+        :param solver: The solver
+        :param instances: ``batch`` instances on the CPU
+        :param rows: Indices of those to solve
+        :param time_limit: Seconds per instance
+        :param seed: Of the solver
+        :return: Index and result of each, as they become known; in any order with several processes
+        """
+        if not isinstance(solver, OneByOneSolver):
+            yield from self._run_batched(solver, instances, rows, time_limit, seed)
+        elif self.n_jobs == 1:
+            for row in rows:
+                yield row, solve_row(solver, instances[row], row, time_limit, seed)
+        else:
+            yield from self._run_in_processes([Task.of(solver, instances, row, time_limit, seed) for row in rows])
+
+    def _run_batched(
+        self, solver: Solver, instances: Instances, rows: Sequence[int], time_limit: float | None, seed: int
+    ) -> Iterator[tuple[int, SolverResult | Failure]]:
+        missing = dict.fromkeys(rows)
+        failure = Failure("the solver returned nothing")
+        try:
+            for row, result in solver.solve_rows(instances, rows, time_limit, seed):
+                del missing[row]
+                yield row, result
+        except Exception as error:
+            failure = Failure.of(error)
+        yield from ((row, failure) for row in missing)
+
+    def _run_in_processes(self, tasks: Sequence[Task]) -> Iterator[tuple[int, SolverResult | Failure]]:
+        waiting, suspects = deque(tasks), deque[Task]()
+        suspected: set[int] = set()
+        running: dict[Future[SolverResult | Failure], Task] = {}
+        while waiting or suspects or running:
+            # When a process has died, each of the instances that may have been the reason runs alone.
+            queue, room = (suspects, 1) if suspects else (waiting, self.n_jobs * TASKS_PER_PROCESS)
+            while queue and len(running) < room:
+                task = queue.popleft()
+                running[self._submit(task)] = task
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = running.pop(future)
+                try:
+                    yield task.row, future.result()
+                except (BrokenProcessPool, CancelledError):
+                    self._end_pool()
+                    if task.row in suspected:
+                        yield task.row, Failure("its process died; was it out of memory?")
+                    else:
+                        suspected.add(task.row)
+                        suspects.append(task)
+                except Exception as error:
+                    # What cannot be sent to another process.
+                    yield task.row, Failure.of(error)
+
+    def _submit(self, task: Task) -> Future[SolverResult | Failure]:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self.n_jobs, multiprocessing.get_context("spawn"), _start_worker)
+        try:
+            return self._pool.submit(task.run)
+        except BrokenProcessPool:
+            self._end_pool()
+            return self._submit(task)
+
+    def _end_pool(self) -> None:
+        """End all processes, whatever they are doing."""
+        if self._pool is None:
+            return
+        # As terminate_workers of Python 3.14 does.
+        processes = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        self._pool = None

@@ -1,0 +1,323 @@
+"""Running solvers on the same instances, with one independent check of everything that they return."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import InfeasibleScheduleError, ScheduleReport, check_schedule, schedule_to_json
+from sb3_uav.evaluation.parallel import Failure, Runner
+from sb3_uav.evaluation.results import (
+    FAILED,
+    INFEASIBLE,
+    OK,
+    RESULTS_FILE,
+    SCHEDULES_FILE,
+    EvaluationFolder,
+    ResultKey,
+    ResultRow,
+    locked_folder,
+    one_line,
+)
+from sb3_uav.evaluation.summary import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarise, write_summary
+from sb3_uav.evaluation.table import print_table
+from sb3_uav.solvers.base import Solver, SolverResult, solver_factory, solver_label
+
+__all__ = ["RESULTS_FILE", "SCHEDULES_FILE", "SummaryRow", "UnavailableSolver", "evaluate", "find_reference", "print_table"]
+
+logger = logging.getLogger(__name__)
+
+# What is done, how many instances of it are done already, and how many there are.
+Progress = Callable[[str, int, int], None]
+
+
+class UnavailableSolver(Solver):
+    """
+    Stands for a solver that could not be made, so that the evaluation of the others says so.
+
+    It has the name of that solver, and as far as is known its use of time limits, so that earlier results of that solver are
+    found and later ones take the place of the failures.
+
+    :param spec: The text that it should have been made from
+    :param reason: Why it could not be
+    """
+
+    def __init__(self, spec: str, reason: str) -> None:
+        self.name, self.spec = solver_label(spec), spec
+        self.reason = reason
+        try:
+            self.uses_time_limit = getattr(solver_factory(spec), "uses_time_limit", True)
+        except ImportError:
+            # Not even its class is known.
+            self.uses_time_limit = True
+
+    def check(self, instances: Instances) -> None:
+        raise ValueError(self.reason)
+
+    def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
+        raise ValueError(self.reason)
+
+
+def evaluate(
+    solvers: Sequence[Solver],
+    instances: Instances | Mapping[str, Instances],
+    out_dir: str | os.PathLike[str],
+    seed: int = 0,
+    progress: Progress | None = None,
+    time_limits: Sequence[float | None] = (None,),
+    n_jobs: int = 1,
+    reference: str | None = None,
+    resume: bool = False,
+) -> list[SummaryRow]:
+    """
+    Run every solver on every instance, check all schedules, and compare the solvers.
+
+    Writes ``results.csv`` and ``schedules.jsonl``, row by row as results become known; ``evaluation.json``, which tells what
+    was evaluated, with which settings, versions and hashes; and at the end ``summary.csv`` and ``summary.json``. With several
+    sets of instances, the column ``instance`` counts through all of them in the order given. What a solver finds for an
+    instance depends on the seed and the row of the instance in its set.
+
+    A schedule that the checker refuses is written with ``feasible`` False and without an objective. Where a solver refuses the
+    instances or fails on one, ``status`` is ``failed`` and ``message`` says why; the other solvers go on.
+
+    :param solvers: The solvers, with different names
+    :param instances: The instances, or several named sets of them
+    :param out_dir: Folder of the files, created if missing
+    :param seed: Seed of the solvers
+    :param progress: Called before each solver starts on each set and after each of its instances
+    :param time_limits: Seconds per instance for solvers that use them, None for their default; all are run one after the other
+    :param n_jobs: In how many processes to run solvers that treat instances one by one; each has one thread, and their times
+        are those of a busy machine. Scripts need the usual ``if __name__ == "__main__"``
+    :param reference: Name of the solver that the others are compared with; the first when None
+    :param resume: Go on with the results of the same solvers and instances in the folder, but for failed ones, instead of
+        starting anew. A solver counts as the same if its name and its settings are: change the name when you change its code
+    :return: One row per set, time limit and solver, in this order
+    :raises ValueError: If there is nothing to do, an argument is not allowed, two solvers have the same name, every solver
+        refuses the instances, the folder cannot be written, or it holds something that cannot be continued
+    """
+    sources = {"instances": instances} if isinstance(instances, Instances) else dict(instances)
+    sources = {source: batch.to("cpu") for source, batch in sources.items()}
+    time_limits = [None if time_limit is None else float(time_limit) for time_limit in time_limits]
+    _check_arguments(solvers, sources, seed, time_limits)
+    reference = find_reference(solvers, reference)
+    refusals = _refusals(solvers, sources)
+    run = {
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "solvers": [solver.name for solver in solvers],
+        "seed": seed,
+        "time_limits": time_limits,
+        "n_jobs": n_jobs,
+    }
+    out_dir = Path(out_dir)
+    summary: list[SummaryRow] = []
+    with Runner(n_jobs) as runner, locked_folder(out_dir):
+        with EvaluationFolder(out_dir, sources, solvers, run, resume) as folder:
+            if folder.changed_versions:
+                changes = ", ".join(folder.changed_versions)
+                logger.warning(f"{out_dir}: holds results of other versions ({changes}); --overwrite starts anew.")
+            # They tell of other results than those that are going to be.
+            for name in (SUMMARY_CSV, SUMMARY_JSON):
+                (out_dir / name).unlink(missing_ok=True)
+            first_index = 0
+            for source, batch in sources.items():
+                evaluation = _SetEvaluation(source, batch, first_index, seed, folder, runner, progress)
+                for time_limit in time_limits:
+                    results = {
+                        solver.name: evaluation.rows(solver, time_limit, refusals.get((source, solver.name)))
+                        for solver in solvers
+                    }
+                    summary += summarise(source, results, reference, time_limit)
+                first_index += len(batch)
+        write_summary(summary, out_dir, {"reference": reference, "seed": seed})
+    return summary
+
+
+def find_reference(solvers: Sequence[Solver], reference: str | None) -> str:
+    """
+    :param solvers: The solvers
+    :param reference: Name of one of them, or its beginning up to the colon; the first one when None
+    :return: The whole name
+    :raises ValueError: If it names none of them, or several
+    """
+    names = [solver.name for solver in solvers]
+    if reference is None:
+        return names[0]
+    found = [name for name in names if name == reference] or [name for name in names if name.partition(":")[0] == reference]
+    if len(found) != 1:
+        raise ValueError(f"The reference {reference!r} is {'none' if not found else 'several'} of the solvers {names}.")
+    return found[0]
+
+
+def _check_arguments(
+    solvers: Sequence[Solver], sources: Mapping[str, Instances], seed: int, time_limits: Sequence[float | None]
+) -> None:
+    """
+    :raises ValueError: If an argument of :func:`evaluate` is not allowed
+    """
+    names = [solver.name for solver in solvers]
+    if not names or not sources or not time_limits:
+        raise ValueError("There is nothing to evaluate: give at least one solver and one set of instances.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"Solver {name!r} is given twice; every solver needs a name of its own.")
+    for name in (*names, *sources):
+        if "\n" in name or "\r" in name:
+            raise ValueError(f"The name {name!r} breaks the line; give another one.")
+    if seed < 0:
+        raise ValueError(f"The seed is {seed}; it must be at least 0.")
+    for source, batch in sources.items():
+        try:
+            batch.validate()
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
+    for time_limit in time_limits:
+        # Whether 0 is enough is for the solver to say.
+        if time_limit is not None and not 0 <= time_limit < math.inf:
+            raise ValueError(f"A time limit is {time_limit}; it must be a number of seconds, at least 0.")
+        if time_limits.count(time_limit) > 1:
+            raise ValueError(f"The time limit {time_limit} is given twice.")
+
+
+def _refusals(solvers: Sequence[Solver], sources: Mapping[str, Instances]) -> dict[tuple[str, str], str]:
+    """
+    :param solvers: The solvers
+    :param sources: The sets of instances
+    :return: Why a solver cannot solve a set, by the names of set and solver
+    :raises ValueError: If no solver can solve anything
+    """
+    refusals = {}
+    for source, batch in sources.items():
+        for solver in solvers:
+            try:
+                solver.check(batch)
+            except Exception as error:
+                # Of whatever kind: the others can do without it.
+                refusals[source, solver.name] = Failure.of(error).message
+    if len(refusals) == len(solvers) * len(sources):
+        raise ValueError(
+            " ".join(f"{source}: {solver} cannot solve these instances: {why}" for (source, solver), why in refusals.items())
+        )
+    return refusals
+
+
+class _SetEvaluation:
+    """
+    Evaluates solvers on one set of instances.
+
+    :param source: Name of the set
+    :param instances: The set, on the CPU
+    :param first_index: Index of its first instance in the files
+    :param seed: Seed of the solvers
+    :param folder: Where results come from and go to
+    :param runner: Runs the solvers
+    :param progress: Called before each solver starts and after each of its instances
+    """
+
+    def __init__(
+        self,
+        source: str,
+        instances: Instances,
+        first_index: int,
+        seed: int,
+        folder: EvaluationFolder,
+        runner: Runner,
+        progress: Progress | None,
+    ) -> None:
+        self.source = source
+        self.instances = instances
+        self.first_index = first_index
+        self.seed = seed
+        self.folder = folder
+        self.runner = runner
+        self.progress = progress
+        self._n_tasks = instances.task_mask.sum(1).tolist()
+        self._found: dict[tuple[str, float | None], list[ResultRow]] = {}
+
+    def rows(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
+        """
+        :param solver: A solver
+        :param time_limit: Seconds per instance, if the solver uses them
+        :param refusal: Why it cannot solve the set, if it cannot
+        :return: Its results on all instances: those that are there already, and those of now
+        """
+        time_limit = time_limit if solver.uses_time_limit else None
+        if (solver.name, time_limit) not in self._found:
+            self._found[solver.name, time_limit] = self._run(solver, time_limit, refusal)
+        return self._found[solver.name, time_limit]
+
+    def _run(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
+        """Find what :meth:`rows` returns."""
+        keys = [ResultKey(solver.name, self.first_index + row, time_limit, self.seed) for row in range(len(self.instances))]
+        missing = [
+            row for row, key in enumerate(keys) if key not in self.folder.rows or self.folder.rows[key].status == FAILED
+        ]
+        limit = "" if time_limit is None else f", {time_limit:g} s each"
+        text = f"{solver.name} on {self.source}: {len(keys)} instances{limit}"
+        if len(missing) < len(keys):
+            text += f", {len(keys) - len(missing)} of them done before"
+        n_done = len(keys) - len(missing)
+        if self.progress is not None:
+            self.progress(text, n_done, len(keys))
+        if refusal is not None:
+            for row in missing:
+                self._add(solver, row, time_limit, Failure(refusal))
+        else:
+            for row, result in self.runner.run(solver, self.instances, missing, time_limit, self.seed):
+                self._add(solver, row, time_limit, result)
+                n_done += 1
+                if self.progress is not None:
+                    self.progress(text, n_done, len(keys))
+        return [self.folder.rows[key] for key in keys]
+
+    def _add(self, solver: Solver, row: int, time_limit: float | None, result: SolverResult | Failure) -> None:
+        """
+        Check a result and write it down.
+
+        :param solver: Whose it is
+        :param row: Row of its instance in the set
+        :param time_limit: Seconds that the solver was given
+        :param result: What it found, or why it did not
+        """
+        report: ScheduleReport | None = None
+        status, message = OK, ""
+        line: dict[str, Any] | None = None
+        if isinstance(result, Failure):
+            status, message = FAILED, result.message
+        else:
+            try:
+                report = check_schedule(self.instances, row, result.schedule)
+            except InfeasibleScheduleError as error:
+                status, message = INFEASIBLE, one_line(error)
+            index = self.first_index + row
+            line = schedule_to_json(solver.name, index, result.schedule, report or ScheduleReport(math.nan, ()))
+            if report is None:
+                # JSON has no NaN.
+                line["objective"] = None
+        solved = None if isinstance(result, Failure) else result
+        bound = None if solved is None or solved.bound is None or not math.isfinite(solved.bound) else float(solved.bound)
+        self.folder.add(
+            ResultRow(
+                solver=solver.name,
+                instance=self.first_index + row,
+                n_uavs=self.instances.n_uavs,
+                n_tasks=self._n_tasks[row],
+                objective=None if report is None else report.objective,
+                length=None if report is None else report.length,
+                seconds=None if solved is None else solved.seconds,
+                feasible=report is not None,
+                source=self.source,
+                time_limit=time_limit,
+                seed=self.seed,
+                batch_size=None if solved is None else solved.batch_size,
+                bound=bound,
+                status=status,
+                message=message,
+            ),
+            line,
+        )

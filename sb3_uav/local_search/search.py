@@ -1,0 +1,233 @@
+"""Better schedules from given ones: local search until nothing changes, and ruin and recreate for as long as one likes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+import numpy as np
+
+from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances, UniformGenerator
+from sb3_uav.envs.reduction import USABLE_TOLERANCE
+from sb3_uav.envs.schedule import Schedule, ScheduleReport, check_schedule
+from sb3_uav.local_search import kernels
+from sb3_uav.local_search.kernels import AnnealingSettings, Plan
+
+# How many nearest tasks of every task are known.
+N_NEAR = 64
+# Local search joins a task to this many neighbours, and looks for an insertion beside so many.
+N_NEAR_JOINED, N_NEAR_INSERTED = 10, 16
+# Local search takes strings of at most so many tasks out.
+MAX_STRING = 3
+# Kernels know values to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are far
+# above what kernels take for rounding errors of lengths.
+VALUE_BITS = 36
+# Ruin and recreate returns to Python about this often, in seconds, to look at the clock.
+CHUNK_SECONDS = 0.02
+# The repair after it ends at the latest so many seconds after the given time.
+LAST_REPAIR_SECONDS = 1.0
+# Trials per task where no time is given.
+TRIALS_PER_TASK = 100
+
+
+class LocalSearch:
+    """
+    One instance, prepared for searches from as many schedules as one likes; several threads may search at once.
+
+    Tasks of value 0 and tasks that no UAV can reach are left out; a schedule loses them.
+
+    :param instance: A batch of one, possibly padded
+    :raises ValueError: If it is not one instance
+    """
+
+    def __init__(self, instance: Instances) -> None:
+        if len(instance) != 1:
+            raise ValueError(f"Local search treats one instance at a time, found {len(instance)}; select one by its index.")
+        self.instance = instance = instance.to("cpu")
+        depot, max_distance = instance.depot[0].numpy(), float(instance.max_distance[0])
+        points, values = (instance.tasks[0].numpy() - depot) / max_distance, instance.values[0].numpy()
+        within_reach = 2.0 * np.hypot(points[:, 0], points[:, 1]) <= (1.0 + DISTANCE_TOLERANCE) ** 2
+        self._tasks = np.flatnonzero(instance.task_mask[0].numpy() & (values > 0) & within_reach)
+        self._nodes = np.zeros(len(self._tasks) + 1, kernels.NODE)
+        self._nodes["x"][1:], self._nodes["y"][1:] = points[self._tasks].T
+        # In whole multiples of a power of two, so that kernels add them up without rounding errors: else a search that takes
+        # such an error for a gain never ends. At most 1, so that sums neither vanish nor overflow.
+        values = values[self._tasks]
+        scaled = np.ldexp(values, VALUE_BITS - np.frexp(values.max(initial=0.0))[1])
+        self._nodes["value"][1:] = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -VALUE_BITS)
+        self._node_of_task = np.zeros(instance.n_tasks, np.int64)
+        self._node_of_task[self._tasks] = np.arange(1, len(self._tasks) + 1)
+        self._limit = 1.0 + USABLE_TOLERANCE
+        self._near = np.zeros((len(self._nodes), max(min(N_NEAR, len(self._tasks) - 1), 0)), np.int32)
+        kernels.find_near(self._nodes, self._near)
+
+    def _load(self, schedule: Schedule, seed: int = 0) -> Plan:
+        """
+        :param schedule: A feasible schedule
+        :param seed: Of the random numbers
+        :return: What kernels work on
+        """
+        n_uavs, n_tasks = self.instance.n_uavs, len(self._tasks)
+        nodes = self._nodes.copy()
+        nodes["owner"] = -1
+        state = np.zeros(1, kernels.STATE)
+        state["limit"] = self._limit
+        # The generator must not start from 0.
+        state["random"] = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
+        routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
+        tours = np.zeros(n_uavs, kernels.TOUR)
+        for uav, route in enumerate(schedule.routes):
+            stops = self._node_of_task[list(route)]
+            stops = stops[stops > 0]
+            routes[uav, 1 : len(stops) + 1] = stops
+            tours["size"][uav] = len(stops)
+        plan = Plan(nodes, self._near, routes, tours, np.zeros((4, n_tasks + n_uavs + 1), np.int64), state)
+        kernels.measure_all(plan)
+        return plan
+
+    def _unload(self, plan: Plan) -> Schedule:
+        return Schedule(self._tasks[plan.routes[uav, 1 : size + 1] - 1] for uav, size in enumerate(plan.tours["size"]))
+
+    def report(self, schedule: Schedule) -> ScheduleReport:
+        """
+        :param schedule: A schedule of the instance
+        :return: What it achieves
+        :raises InfeasibleScheduleError: If it breaks a constraint
+        """
+        return check_schedule(self.instance, 0, schedule)
+
+    def _better(self, found: Schedule, given: Schedule) -> Schedule:
+        """``found``, unless ``given`` is better. Kernels compare sums with rounding errors; this does not."""
+        new, old = self.report(found), self.report(given)
+        return found if (new.objective, -new.length) >= (old.objective, -old.length) else given
+
+    def repair(self, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
+        """See :func:`repair`."""
+        end = time.perf_counter() + (np.inf if seconds is None else seconds)
+        self.report(schedule)
+        plan = self._load(schedule)
+        while time.perf_counter() < end and kernels.descend(plan, N_NEAR_JOINED, N_NEAR_INSERTED, max_string):
+            pass
+        return self._better(self._unload(plan), schedule)
+
+    def improve(
+        self,
+        schedule: Schedule,
+        seconds: float | None = None,
+        seed: int = 0,
+        settings: AnnealingSettings | None = None,
+        n_trials: int | None = None,
+    ) -> Schedule:
+        """See :func:`improve`; ``n_trials`` is the number of trials where no time is given."""
+        start = time.perf_counter()
+        self.report(schedule)
+        settings = settings or AnnealingSettings()
+        plan = self._load(schedule, seed)
+        best = self._load(schedule)
+        if len(self._tasks) > 0:
+            if seconds is None:
+                n_trials = TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
+                kernels.anneal(plan, best, n_trials, 0.0, 1.0, settings)
+            else:
+                self._anneal(plan, best, start, seconds, settings)
+        kernels.measure_all(best)
+        end = start + (np.inf if seconds is None else seconds + LAST_REPAIR_SECONDS)
+        while time.perf_counter() < end and kernels.descend(best, N_NEAR_JOINED, N_NEAR_INSERTED, MAX_STRING):
+            pass
+        return self._better(self._unload(best), schedule)
+
+    @staticmethod
+    def _anneal(plan: Plan, best: Plan, start: float, seconds: float, settings: AnnealingSettings) -> None:
+        """
+        Anneal until the time is up.
+
+        :param plan: Where to begin
+        :param best: The best schedule so far, updated
+        :param start: When the time began
+        :param seconds: Of which length
+        :param settings: See there
+        """
+        n_trials = 10
+        now = time.perf_counter()
+        while now < start + seconds:
+            progress = (now - start) / seconds
+            chunk = min(CHUNK_SECONDS, start + seconds - now)
+            kernels.anneal(plan, best, n_trials, progress, min(progress + chunk / seconds, 1.0), settings)
+            then, now = now, time.perf_counter()
+            n_trials = max(1, int(n_trials * min(CHUNK_SECONDS / max(now - then, 1e-9), 4.0)))
+
+
+def warm_up() -> None:
+    """
+    Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
+    """
+    instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
+    search = LocalSearch(instance)
+    search.repair(search.improve(Schedule([])))
+
+
+def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
+    """
+    Local search until nothing changes.
+
+    Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
+    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of
+    tasks out to fill the gap better. Deterministic, and a second repair changes nothing. Differences between values below
+    1e-10 of the greatest do not count, but the result is never worse for them.
+
+    :param instance: A batch of one, possibly padded
+    :param schedule: A feasible schedule of it
+    :param seconds: When to stop, at the end of a round, even if there is more to be found; None for never
+    :param max_string: How many tasks in a row are taken out at most; 0 for none, which is faster and less good
+    :return: A feasible schedule that is not worse: of the same value it is not longer
+    :raises InfeasibleScheduleError: If the schedule breaks a constraint
+    :raises ValueError: If there is not exactly one instance
+    """
+    return LocalSearch(instance).repair(schedule, seconds, max_string)
+
+
+def repair_best(instance: Instances, schedules: Iterable[Schedule], seconds: float | None = None) -> Schedule:
+    """
+    Repair several schedules of an instance, the best first, and keep the best.
+
+    The compiled part does not hold the GIL, so that threads can treat several instances at once.
+
+    :param instance: A batch of one, possibly padded
+    :param schedules: Feasible schedules of it, at least one
+    :param seconds: When to stop, even if some have not been repaired; None for never
+    :return: The best
+    :raises InfeasibleScheduleError: If a schedule breaks a constraint
+    :raises ValueError: If there is not exactly one instance, or no schedule
+    """
+    end = time.perf_counter() + (np.inf if seconds is None else seconds)
+    search = LocalSearch(instance)
+    reports = [(search.report(schedule), schedule) for schedule in dict.fromkeys(schedules)]
+    if not reports:
+        raise ValueError("There is no schedule to repair; give at least one.")
+    reports.sort(key=lambda pair: (-pair[0].objective, pair[0].length))
+    best = reports[0][1]
+    for _, schedule in reports:
+        left = end - time.perf_counter()
+        if left <= 0:
+            break
+        best = search._better(search.repair(schedule, left), best)
+    return best
+
+
+def improve(instance: Instances, schedule: Schedule, seconds: float | None = None, seed: int = 0) -> Schedule:
+    """
+    Ruin and recreate, for as long as one likes.
+
+    Strings of neighbouring tasks are taken out of one to three tours and the gaps filled again, with worse schedules accepted
+    as in simulated annealing; then the best is repaired. Value comes first, then length.
+
+    :param instance: A batch of one, possibly padded
+    :param schedule: A feasible schedule of it; an empty one will do
+    :param seconds: Wall time, exceeded only by the last repair, whose last round starts within a second; if None, trials in
+        proportion to the number of tasks
+    :param seed: Of the random numbers; without ``seconds`` the same seed gives the same schedule
+    :return: A feasible schedule that is not worse: of the same value it is not longer
+    :raises InfeasibleScheduleError: If the schedule breaks a constraint
+    :raises ValueError: If there is not exactly one instance
+    """
+    return LocalSearch(instance).improve(schedule, seconds, seed)

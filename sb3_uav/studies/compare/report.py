@@ -1,0 +1,327 @@
+"""What :mod:`sb3_uav.studies.compare.study` says about its runs: a CSV, a figure and a report in Markdown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+import sb3_uav
+from sb3_uav.common.files import write_atomically
+from sb3_uav.common.statistics import confidence_halfwidth
+from sb3_uav.plots.bands import Band, BandPanel, plot_bands
+from sb3_uav.training.fixed_set import EvaluationHistory
+
+CSV_FILE = "evaluations.csv"
+REPORT_FILE = "report.md"
+FIGURE_AXES = {
+    "timesteps": "environment steps",
+    "train_seconds": "seconds of training",
+    "cpu_seconds": "CPU seconds of training",
+}
+FIGURE_FILES = ("comparison.png", "comparison.pdf")
+CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
+PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
+GRID_POINTS = 200
+
+
+class Run(NamedTuple):
+    """
+    One finished training.
+
+    :param variant: Name of what is compared
+    :param algorithm: rl_zoo3's name of its algorithm
+    :param seed: Its seed
+    :param history: Its evaluations
+    """
+
+    variant: str
+    algorithm: str
+    seed: int
+    history: EvaluationHistory
+
+
+class Estimate(NamedTuple):
+    """
+    :param mean: The mean
+    :param half_width: Of its 95 % confidence interval; NaN for a single value
+    """
+
+    mean: float
+    half_width: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.2f}" if math.isnan(self.half_width) else f"{self.mean:.2f} ± {self.half_width:.2f}"
+
+
+class TableRow(NamedTuple):
+    """
+    One variant at one time.
+
+    :param variant: Its name
+    :param n_seeds: Number of its runs
+    :param timesteps: Mean of the steps at that time
+    :param seconds: Mean of the wall seconds of training at that time
+    :param cpu_seconds: Mean of the CPU seconds, which other processes on the machine disturb less
+    :param greedy: Mean objective of greedy decoding; the interval is over seeds
+    :param sampled: The same of the best of the samples; None without sampling
+    :param difference: Greedy objective minus that of the best variant, paired instance by instance; the interval is over
+        instances
+    """
+
+    variant: str
+    n_seeds: int
+    timesteps: float
+    seconds: float
+    cpu_seconds: float
+    greedy: Estimate
+    sampled: Estimate | None
+    difference: Estimate
+
+
+def by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """
+    :param runs: Runs
+    :return: The same by variant, in order of appearance
+    """
+    return {name: [run for run in runs if run.variant == name] for name in dict.fromkeys(run.variant for run in runs)}
+
+
+def estimate(values: np.ndarray) -> Estimate:
+    """
+    :param values: ``(n,)``
+    :return: Their mean and its confidence interval
+    """
+    return Estimate(float(values.mean()), float(confidence_halfwidth(values)))
+
+
+def interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """
+    Linear between evaluations, constant before the first and after the last.
+
+    :param x: ``(n_evaluations,)``, increasing
+    :param values: ``(n_evaluations, n_instances)``
+    :param at: ``(n,)``
+    :return: ``(n, n_instances)``
+    """
+    if len(x) == 1:
+        return np.repeat(values, len(at), axis=0)
+    upper = np.clip(np.searchsorted(x, at), 1, len(x) - 1)
+    span = x[upper] - x[upper - 1]
+    weight = np.clip((at - x[upper - 1]) / np.where(span > 0, span, 1), 0.0, 1.0)[:, None]
+    return (1 - weight) * values[upper - 1] + weight * values[upper]
+
+
+def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
+    """
+    :param runs: Finished runs
+    :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
+    :param at: Where on that axis
+    :return: One row per variant, the best first
+    """
+    where = np.array([at])
+
+    def of(run: Run, field: str) -> np.ndarray:
+        values = np.asarray(getattr(run.history, field), dtype=np.float64)
+        values = values[:, None] if values.ndim == 1 else values
+        return interpolate(getattr(run.history, axis), values, where)[0]
+
+    groups = by_variant(runs)
+    # (n_seeds, n_instances) each.
+    greedy = {name: np.stack([of(run, "results") for run in group]) for name, group in groups.items()}
+    best = max(greedy, key=lambda name: greedy[name].mean())
+    rows = []
+    for name, group in groups.items():
+        sampled = np.stack([of(run, "sampled") for run in group])
+        rows.append(
+            TableRow(
+                variant=name,
+                n_seeds=len(group),
+                timesteps=float(np.mean([of(run, "timesteps") for run in group])),
+                seconds=float(np.mean([of(run, "train_seconds") for run in group])),
+                cpu_seconds=float(np.mean([of(run, "cpu_seconds") for run in group])),
+                greedy=estimate(greedy[name].mean(1)),
+                sampled=estimate(sampled.mean(1)) if sampled.shape[1] > 0 else None,
+                difference=estimate(greedy[name].mean(0) - greedy[best].mean(0)),
+            )
+        )
+    return sorted(rows, key=lambda row: -row.greedy.mean)
+
+
+def compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Band:
+    """
+    :param group: The runs of one variant
+    :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
+    :param field: ``"results"`` or ``"sampled"``
+    :param end: Where the curve ends at the latest; no later than the shortest run
+    :return: Mean over seeds and its confidence interval
+    """
+    last = min(float(getattr(run.history, axis)[-1]) for run in group)
+    grid = np.linspace(0.0, min(last, end), GRID_POINTS)
+    curves = []
+    for run in group:
+        means = getattr(run.history, field).mean(1)
+        curves.append(interpolate(getattr(run.history, axis), means[:, None], grid)[:, 0])
+    stacked = np.stack(curves)
+    return Band(grid, stacked.mean(0), confidence_halfwidth(stacked))
+
+
+def draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None:
+    """
+    :param runs: Finished runs
+    :param budget: Environment steps of each
+    :param n_samples: Samples per instance
+    :param folder: Where to write the figures
+    """
+    groups = by_variant(runs)
+    fields = {"results": "greedy"}
+    if n_samples > 0:
+        fields["sampled"] = f"best of {n_samples} samples"
+    lines = []
+    for field, label in fields.items():
+        line = []
+        for axis, x_label in FIGURE_AXES.items():
+            end = budget if axis == "timesteps" else math.inf
+            bands = {name: compute_band(group, axis, field, end) for name, group in groups.items()}
+            line.append(BandPanel(x_label, f"mean objective, {label}", bands))
+        lines.append(line)
+    for name in FIGURE_FILES:
+        plot_bands(lines, folder / name)
+
+
+def csv_text(runs: Sequence[Run]) -> str:
+    """
+    :param runs: Finished runs
+    :return: One row per evaluation
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    for run in runs:
+        history = run.history
+        for i in range(len(history.timesteps)):
+            sampled = f"{history.sampled[i].mean():.6f}" if history.sampled.shape[1] > 0 else ""
+            seconds = (f"{history.train_seconds[i]:.3f}", f"{history.cpu_seconds[i]:.3f}")
+            means = (f"{history.results[i].mean():.6f}", sampled)
+            writer.writerow([run.algorithm, run.variant, run.seed, int(history.timesteps[i]), *seconds, *means])
+    return text.getvalue()
+
+
+def markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
+    """
+    :param rows: The best first
+    :param n_samples: Samples per instance
+    :return: A table
+    """
+    columns = ["", "seeds", "steps", "seconds", "CPU seconds", "greedy"]
+    columns += [f"best of {n_samples}"] * (n_samples > 0) + ["greedy, difference to the best"]
+    lines = [columns, ["---"] + ["---:"] * (len(columns) - 1)]
+    for number, row in enumerate(rows):
+        times = [f"{row.timesteps:,.0f}", f"{row.seconds:,.1f}", f"{row.cpu_seconds:,.1f}"]
+        cells = [row.variant, str(row.n_seeds), *times, str(row.greedy)]
+        cells += [str(row.sampled)] * (n_samples > 0) + ["" if number == 0 else str(row.difference)]
+        lines.append(cells)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def machine(n_threads: int, n_jobs: int, device: str) -> str:
+    """
+    :param n_threads: Threads of each training
+    :param n_jobs: Trainings side by side
+    :param device: Where they ran
+    :return: A line about the machine
+    """
+    processor = platform.processor() or platform.machine()
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        models = [line.partition(":")[2].strip() for line in information.read_text().splitlines() if "model name" in line]
+        processor = models[0] if models else processor
+    text = f"{os.cpu_count()} logical cores of {processor}, {platform.system()}, {platform.machine()}"
+    if device != "cpu" and th.cuda.is_available():
+        text += f", {th.cuda.get_device_name()}"
+    return f"{text}; {n_jobs} training(s) side by side, {n_threads} thread(s) each, device {device}"
+
+
+def versions() -> str:
+    """:return: What the figures were made with"""
+    found = [f"sb3_uav {sb3_uav.__version__}", f"Python {platform.python_version()}"]
+    for package in PACKAGES:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            found.append(f"{package} of unknown version")
+    return ", ".join(found)
+
+
+def write_results(
+    runs: Sequence[Run],
+    folder: Path,
+    title: str,
+    budget: int,
+    n_samples: int,
+    notes: Sequence[str],
+    commands: Mapping[str, str],
+) -> None:
+    """
+    Write the CSV, the figures and the report.
+
+    :param runs: Finished runs, at least one
+    :param folder: Where to
+    :param title: Title of the report
+    :param budget: Environment steps of each run
+    :param n_samples: Samples per instance
+    :param notes: How it was done, a line each
+    :param commands: What each command does, and the command
+    """
+    write_atomically(folder / CSV_FILE, csv_text(runs))
+    draw(runs, budget, n_samples, folder)
+    wall, cpu = (min(float(getattr(run.history, axis)[-1]) for run in runs) for axis in ("train_seconds", "cpu_seconds"))
+    lines = [
+        f"# {title}",
+        "",
+        *(f"- {note}" for note in notes),
+        "",
+        f"![Learning curves]({FIGURE_FILES[0]})",
+        "",
+        "*Mean objective on the validation set; bands are 95 % confidence intervals over seeds.*",
+        "",
+        f"## At equal environment steps: {budget:,}",
+        "",
+        markdown_table(compute_table(runs, "timesteps", budget), n_samples),
+        "",
+        f"## At equal wall time: {wall:,.1f} s of training",
+        "",
+        "The time of the fastest run.",
+        "",
+        markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
+        "",
+        f"## At equal CPU time: {cpu:,.1f} s of training",
+        "",
+        "Other work on the machine lengthens wall time, from run to run by another factor; it hardly changes CPU time.",
+        "",
+        markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
+        "",
+        "## How to read this",
+        "",
+        "Objectives: mean over the validation instances, and the 95 % confidence interval over training seeds (Student's t).",
+        "Last column: a variant's greedy objective (mean over its seeds) minus that of the best variant, paired instance by",
+        "instance, and the 95 % confidence interval over instances. Values between two evaluations are interpolated.",
+        "Seconds are wall time of learning alone: evaluations, saving and the start of the process are left out. Greedy",
+        "episodes of the rollout baseline take time but are no environment steps.",
+        "",
+        "## Commands",
+        "",
+        *(f"{what}:\n\n```bash\n{command}\n```\n" for what, command in commands.items()),
+        f"Data: [{CSV_FILE}]({CSV_FILE}), one row per evaluation.",
+        "",
+    ]
+    write_atomically(folder / REPORT_FILE, "\n".join(lines))

@@ -1,0 +1,150 @@
+"""Running trainings of the zoo in processes of their own, so that finished ones are never repeated."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from sb3_uav.common.files import write_atomically
+from sb3_uav.training.fixed_set import RESULTS_FILE, EvaluationHistory
+
+FINISHED_FILE = "finished.json"
+LOG_FILE = "train.log"
+
+
+class Training(NamedTuple):
+    """
+    One run.
+
+    :param name: What it trains
+    :param algo: rl_zoo3's name of the algorithm
+    :param env_id: Id of the environment
+    :param seed: The seed
+    :param n_timesteps: Environment steps that it is going to take at least
+    :param config: The YAML
+    :param folder: Folder of everything that it writes
+    :param n_threads: Number of threads
+    :param device: Where to train
+    """
+
+    name: str
+    algo: str
+    env_id: str
+    seed: int
+    n_timesteps: int
+    config: Path
+    folder: Path
+    n_threads: int = 1
+    device: str = "cpu"
+
+    @property
+    def flags(self) -> list[str]:
+        """What follows ``python``."""
+        flags = ["-m", "sb3_uav.zoo.train", "--algo", self.algo, "--env", self.env_id, "--conf-file", str(self.config)]
+        flags += ["--log-folder", str(self.folder), "--seed", str(self.seed), "--eval-freq", "-1", "--log-interval", "-2"]
+        return [*flags, "--num-threads", str(self.n_threads), "--device", self.device]
+
+    @property
+    def is_finished(self) -> bool:
+        return (self.folder / FINISHED_FILE).is_file()
+
+    @property
+    def history(self) -> EvaluationHistory:
+        """
+        What FixedSetEvalCallback left.
+
+        :raises FileNotFoundError: If it left nothing
+        """
+        return EvaluationHistory.load(self.folder / self.algo / f"{self.env_id}_1" / RESULTS_FILE)
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """:return: The process of this training"""
+        if self.folder.exists():
+            # An interrupted run: half a curve is worth nothing in a comparison.
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(parents=True)
+        environment = {**os.environ, "OMP_NUM_THREADS": str(self.n_threads)}
+        with (self.folder / LOG_FILE).open("wb") as log:
+            # In a session of its own, because rl_zoo3 takes Ctrl-C for an orderly end.
+            return subprocess.Popen(
+                [sys.executable, *self.flags],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
+
+    def finish(self, exit_code: int, seconds: float) -> str | None:
+        """
+        Mark this run as finished, if it is.
+
+        :param exit_code: Of its process
+        :param seconds: Wall time of its process
+        :return: Otherwise what went wrong
+        """
+        log = self.folder / LOG_FILE
+        if exit_code != 0:
+            lines = log.read_text(errors="replace").strip().splitlines()
+            return f"{log}: {lines[-1] if lines else f'exit code {exit_code}'}"
+        try:
+            reached = int(self.history.timesteps[-1])
+        except (FileNotFoundError, ValueError) as error:
+            return f"{log}: {error}"
+        if reached < self.n_timesteps:
+            return f"{log}: stopped after {reached} of {self.n_timesteps} steps"
+        note = {"command": shlex.join(["python", *self.flags]), "process_seconds": round(seconds, 1)}
+        write_atomically(self.folder / FINISHED_FILE, json.dumps(note, indent=1))
+        return None
+
+
+def run_trainings(trainings: Sequence[Training], n_jobs: int) -> None:
+    """
+    Run trainings side by side. Whatever ends this function early ends its processes too.
+
+    :param trainings: What to run, in this order
+    :param n_jobs: How many at once
+    :raises ValueError: If some failed, after all others are through
+    """
+    waiting = list(trainings)
+    running: list[tuple[Training, subprocess.Popen[bytes], float]] = []
+    failures: list[str] = []
+    with termination_as_interrupt():
+        try:
+            while waiting or running:
+                while waiting and len(running) < n_jobs:
+                    training = waiting.pop(0)
+                    number = len(trainings) - len(waiting)
+                    print(f"[{number}/{len(trainings)}] {training.name}, seed {training.seed}", flush=True)
+                    running.append((training, training.start(), time.time()))
+                for job in [job for job in running if job[1].poll() is not None]:
+                    running.remove(job)
+                    training, process, began = job
+                    failure = training.finish(process.returncode, time.time() - began)
+                    failures += [] if failure is None else [failure]
+                time.sleep(0.1)
+        finally:
+            for _, process, _ in running:
+                process.terminate()
+                process.wait()
+    if failures:
+        raise ValueError(f"{len(failures)} of {len(trainings)} trainings failed: {'; '.join(failures)}")
+
+
+@contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt, so that `finally` blocks are run."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,153 @@
+"""Evaluations on the paper's kind of instances, shared by all tables and figures that need the same results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_uav.common.random_streams import TEST_SEED
+from sb3_uav.envs.instances import Instances, UniformGenerator
+from sb3_uav.evaluation.run import Progress, UnavailableSolver, evaluate
+from sb3_uav.evaluation.summary import SummaryRow
+from sb3_uav.solvers.base import Solver, make_solver
+from sb3_uav.studies.reproduce.pairs import Model
+from sb3_uav.studies.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
+from sb3_uav.studies.reproduce.scales import Scale, Scenario
+
+# The paper's baselines, and which solver stands for each.
+BASELINES = {"milp": GUROBI, "ortools": OR_TOOLS, "kmeans-vnd": KMEANS_VND, "kmeans-am": KMEANS_AM}
+
+
+class Results(NamedTuple):
+    """
+    :param rows: What each solver achieved, by its name
+    :param failures: What went wrong
+    """
+
+    rows: dict[str, SummaryRow]
+    failures: list[str]
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """
+    Runs solvers on test instances; results that are there already are used again.
+
+    :param scale: The scale
+    :param out: Folder of all results; those of the evaluations are in ``evaluations``
+    :param seed: Of test instances and solvers
+    :param device: Device of the networks
+    :param n_jobs: How many instances to solve at once, by solvers that treat them one by one
+    :param overwrite: Whether to start anew instead
+    :param progress: Called before each solver starts and after each of its instances
+    """
+
+    scale: Scale
+    out: Path
+    seed: int = 0
+    device: str = "auto"
+    n_jobs: int = 1
+    overwrite: bool = False
+    progress: Progress | None = None
+    # Folders that were written by this process, which are not to be started anew.
+    _begun: set[Path] = field(default_factory=set)
+
+    def instances(self, scenario: Scenario, seed: int | None = None, n_instances: int | None = None) -> Instances:
+        """
+        :param scenario: The paper's name of the situation
+        :param seed: Of these instances; the test instances when None
+        :param n_instances: How many; as many as the scale says when None
+        :return: Uniform instances; fewer of them are the first of more
+        """
+        generator = UniformGenerator(self.scale.n_tasks(scenario), scenario.n_uavs, max_distance=self.scale.max_distance)
+        n_instances = self.scale.n_instances[scenario.n_tasks] if n_instances is None else n_instances
+        key = (TEST_SEED, self.seed) if seed is None else (seed,)
+        return generator(n_instances, np.random.default_rng([*key, scenario.n_uavs, scenario.n_tasks]))
+
+    def run(
+        self, scenario: Scenario, solvers: Sequence[Solver], instances: Instances | None = None, folder: str = ""
+    ) -> Results:
+        """
+        :param scenario: The paper's name of the situation
+        :param solvers: The solvers
+        :param instances: The instances; the scale's test instances when None
+        :param folder: Appended to the name of the folder
+        :return: What each achieved
+        :raises ValueError: If earlier results are of other instances, or of other solvers of the same name
+        """
+        path = self.out / "evaluations" / (scenario.folder + folder)
+        batch = self.instances(scenario) if instances is None else instances
+        refusals = [text for solver in solvers if (text := _refusal(solver, batch)) is not None]
+        if len(refusals) == len(solvers):
+            return Results({}, [f"{scenario.name}: {text}" for text in refusals])
+        resume = not self.overwrite or path in self._begun
+        self._begun.add(path)
+        source = scenario.folder if self.scale.shrink == 1 else f"{scenario.folder} (N = {self.scale.n_tasks(scenario)})"
+        rows = evaluate(solvers, {source: batch}, path, self.seed, self.progress, n_jobs=self.n_jobs, resume=resume)
+        return Results({row.solver: row for row in rows}, [failure for row in rows for failure in row.failures])
+
+    def baseline(self, solver: str, router: Model | None = None) -> Solver:
+        """
+        :param solver: Name of a solver that is not trained, or ``"kmeans-am"``
+        :param router: Whose router ``"kmeans-am"`` uses
+        :return: The solver with the time limit of the scale; one that refuses all instances if a package is missing
+        :raises ValueError: If there is no such solver
+        """
+        options, limit = [], self.scale.time_limits.get(solver)
+        if limit is not None:
+            options.append(f"time_limit={limit:g}")
+        name = BASELINES.get(solver, solver)
+        if solver == "milp":
+            options.append(f"backend={self.scale.exact_backend}")
+            name = f"milp with {self.scale.exact_backend}"
+        if solver == "kmeans-am":
+            from sb3_uav.solvers.kmeans_am import load_kmeans_am
+
+            assert router is not None
+            found: Solver = load_kmeans_am(str(router.router), device=self.device)
+            name = f"{name} {router.label}"
+        else:
+            spec = f"{solver}:{','.join(options)}" if options else solver
+            try:
+                found = make_solver(spec, device=self.device)
+            except (ImportError, ValueError) as error:
+                # A package or a licence.
+                found = UnavailableSolver(spec, str(error))
+        found.name = f"{name} ({limit:g} s)" if limit is not None else name
+        return found
+
+    def pair(self, model: Model, sampling: bool) -> Solver:
+        """
+        :param model: A trained pair
+        :param sampling: Whether to keep the best of several sampled allocations, or to decode greedily
+        :return: The solver
+        """
+        from sb3_uav.solvers.dl_drl import load_dl_drl
+
+        decode = "sampling" if sampling else "greedy"
+        solver = load_dl_drl(str(model.allocator), str(model.router), decode, self.scale.samples, self.device)
+        method = "DL-DRL-I" if model.strategy == "independent" else "DL-DRL"
+        solver.name = f"{method} {model.label} ({f'sampling {self.scale.samples}' if sampling else 'greedy'})"
+        return solver
+
+
+def _refusal(solver: Solver, instances: Instances) -> str | None:
+    """Why a solver cannot solve the instances, if it cannot."""
+    try:
+        solver.check(instances)
+    except ValueError as error:
+        return f"{solver.name}: {error}"
+    return None
+
+
+def complete(row: SummaryRow | None, measure: Callable[[SummaryRow], float]) -> float | None:
+    """
+    :param row: What a solver achieved
+    :param measure: What of it
+    :return: That, if the solver has solved all instances
+    """
+    return None if row is None or row.n_feasible < row.n_instances else measure(row)

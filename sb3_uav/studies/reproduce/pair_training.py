@@ -1,0 +1,207 @@
+"""Training one pair through the zoo, so that an interrupted training goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.evaluation.results import describe_machine
+from sb3_uav.registration import allocation_id
+from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+
+ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
+TRAINING_FILE = "training.json"
+CONFIG_FILE, OUTPUT_FILE = "config.yml", "output.txt"
+ITS_KEY = "sb3_uav.training.ITSCallback"
+
+
+class TrainingError(ValueError):
+    """A training that failed."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    One training.
+
+    :param scenario: The paper's name of the situation
+    :param strategy: One of :data:`~sb3_uav.training.its.STRATEGIES`
+    :param entry: The zoo's YAML entry
+    :param run_folder: Where the zoo writes
+    :param model_folder: Where the zips go when the training is complete
+    :param seed: Seed
+    :param device: Device, as SB3 names it
+    :param num_threads: Threads of torch; its own choice when None
+    """
+
+    scenario: Scenario
+    strategy: str
+    entry: dict[str, Any]
+    run_folder: Path
+    model_folder: Path
+    seed: int
+    device: str
+    num_threads: int | None
+
+    @property
+    def env_id(self) -> str:
+        return allocation_id(self.scenario.n_uavs, self.scenario.n_tasks)
+
+    @property
+    def title(self) -> str:
+        return f"{self.scenario.name}, {self.strategy}"
+
+    @property
+    def its(self) -> Mapping[str, Any]:
+        """The arguments of the interactive training strategy."""
+        return self.entry["callback"][0][ITS_KEY]
+
+    @property
+    def n_epochs(self) -> tuple[int, int]:
+        """How many epochs of pre-training and of the allocator there are."""
+        pretraining = 0 if self.strategy.startswith("ITS/pre-training") else self.its["n_pretraining_epochs"]
+        return pretraining, self.its["n_epochs"]
+
+    def newest_run(self) -> Path | None:
+        """:return: The zoo's folder of the latest run that has a checkpoint, if there is one"""
+        from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
+
+        runs = [state.parents[1] for state in self.run_folder.glob(f"reinforce/*/{CHECKPOINT_FOLDER}/{STATE_FILE}")]
+        return max(runs, key=lambda run: int(run.name.rpartition("_")[2]), default=None)
+
+
+def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: str) -> dict[str, Any]:
+    """
+    :param scale: The scale
+    :param recipe: How pairs are trained
+    :param scenario: What for
+    :param strategy: The training strategy
+    :return: The zoo's YAML entry of the scenario with the changes of the recipe
+    :raises FileNotFoundError: If the zoo's YAML is missing
+    """
+    from sb3_uav.zoo.experiment import default_config, plain_numbers
+
+    config = default_config("reinforce")
+    if config is None:
+        raise FileNotFoundError("reinforce.yml: not found; install sb3-uav again.")
+    shipped = yaml.safe_load(config.read_text(encoding="utf-8"))[allocation_id(scenario.n_uavs, scenario.n_tasks)]
+    entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
+    its = entry["callback"][0][ITS_KEY]
+    its |= {**recipe.its, "strategy": strategy, "verbose": 1}
+    its["router"] |= recipe.router
+    if scenario.n_tasks in recipe.instances_per_epoch:
+        entry["instances_per_epoch"] = recipe.instances_per_epoch[scenario.n_tasks]
+    sizes = {"n_tasks": scale.n_tasks(scenario), "max_distance": scale.max_distance}
+    entry["env_kwargs"] = sizes
+    # More than enough: the strategy ends the training after its last epoch.
+    n_instances = entry["instances_per_epoch"] + entry["n_envs"]
+    entry["n_timesteps"] = its["n_epochs"] * n_instances * entry.get("n_samples", 1) * sizes["n_tasks"]
+    # Independent of what YAML anchors share.
+    return json.loads(json.dumps(entry))
+
+
+def train(job: Job) -> None:
+    """
+    Train a pair, or go on with an interrupted training, and put its zips where they belong.
+
+    :param job: The training
+    :raises TrainingError: If it fails; the message names the file with its output
+    :raises KeyboardInterrupt: If it was interrupted
+    """
+    from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+
+    job.run_folder.mkdir(parents=True, exist_ok=True)
+    config = job.run_folder / CONFIG_FILE
+    text = yaml.safe_dump({job.env_id: job.entry}, sort_keys=False)
+    run = job.newest_run()
+    if run is not None and config.is_file() and config.read_text(encoding="utf-8") != text:
+        raise TrainingError(
+            f"{job.run_folder}: holds an unfinished training with other settings; delete it, or choose another --out."
+        )
+    with replaced_when_complete(config) as file:
+        file.write(text)
+    if run is None or read_state(run / CHECKPOINT_FOLDER)["epoch"] < job.n_epochs[1]:
+        _run_zoo(job, config, run)
+        run = job.newest_run()
+    if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.n_epochs[1]:
+        # rl_zoo3 takes Ctrl-C for the end of the training.
+        raise KeyboardInterrupt
+    _publish(job, run, state)
+
+
+def _run_zoo(job: Job, config: Path, interrupted: Path | None) -> None:
+    """
+    :param job: The training
+    :param config: Its YAML
+    :param interrupted: The zoo's folder of the run to go on with
+    :raises TrainingError: If it fails
+    """
+    from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+    from sb3_uav.zoo import train as zoo
+
+    arguments = ["--algo", "reinforce", "--env", job.env_id, "--conf-file", str(config), "--log-folder", str(job.run_folder)]
+    arguments += ["--seed", str(job.seed), "--device", job.device, "--eval-freq", "-1", "--verbose", "0"]
+    if job.num_threads is not None:
+        arguments += ["--num-threads", str(job.num_threads)]
+    if interrupted is not None:
+        checkpoint = interrupted / CHECKPOINT_FOLDER
+        arguments += ["--trained-agent", str(checkpoint / read_state(checkpoint)["allocator"])]
+    output = job.run_folder / OUTPUT_FILE
+    with output.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
+        code = zoo.main(arguments)
+    if code != 0:
+        last = output.read_text(encoding="utf-8").strip().splitlines()[-1:]
+        raise TrainingError(f"Training {job.title} failed: {''.join(last)} (all of its output is in {output})")
+
+
+def _publish(job: Job, run: Path, state: Mapping[str, Any]) -> None:
+    """
+    Copy what a complete training left to the folder of models.
+
+    :param job: The training
+    :param run: The zoo's folder of the run
+    :param state: Of its checkpoint
+    """
+    from sb3_uav.training.its import CHECKPOINT_FOLDER, LOG_FILE
+
+    temporary = job.model_folder.with_name(job.model_folder.name + ".tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    shutil.copyfile(run / CHECKPOINT_FOLDER / state["allocator"], temporary / ALLOCATOR_FILE)
+    shutil.copyfile(run / CHECKPOINT_FOLDER / state["router"], temporary / ROUTER_FILE)
+    shutil.copyfile(run / LOG_FILE, temporary / ITS_LOG)
+    about = {"seed": job.seed, "strategy": job.strategy, "entry": job.entry, "run": str(run), **describe_machine()}
+    (temporary / TRAINING_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, job.model_folder)
+
+
+def check_complete(job: Job) -> bool:
+    """
+    :param job: A training
+    :return: Whether it is complete
+    :raises TrainingError: If what is there was trained with other settings
+    """
+    path = job.model_folder / TRAINING_FILE
+    if not path.is_file():
+        return False
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+        same = about["entry"] == job.entry and about["seed"] == job.seed
+    except (ValueError, LookupError, TypeError) as error:
+        raise TrainingError(f"{path}: is damaged ({error}); delete {job.model_folder}.") from error
+    if not same:
+        raise TrainingError(
+            f"{job.model_folder}: was trained with other settings or another seed; delete it, choose another --out, or "
+            "name its folder by --models to use it as it is."
+        )
+    return True

@@ -1,0 +1,346 @@
+"""The trained pairs: those that the user has, those that were trained before, and those that have to be trained."""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from sb3_uav.studies.reproduce.pair_training import (
+    ALLOCATOR_FILE,
+    ITS_LOG,
+    ROUTER_FILE,
+    Job,
+    TrainingError,
+    check_complete,
+    train,
+    training_entry,
+)
+from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+
+ITS, INDEPENDENT = "ITS", "independent"
+LEVELS = ("allocator", "router")
+# Folders of the strategies; those of the ablation without what their names say.
+STRATEGY_FOLDERS = {
+    ITS: "ITS",
+    "ITS/pre-training": "ITS-without-pre-training",
+    "ITS/intensive": "ITS-without-intensive",
+    "ITS/pre-training&intensive": "ITS-without-both",
+    INDEPENDENT: "independent",
+}
+# What has to be in every line of a log.
+LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
+# Seconds between two looks at the logs of running trainings.
+POLL_INTERVAL = 1.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """
+    A trained pair.
+
+    :param scenario: What it was trained for
+    :param strategy: How
+    :param folder: Where its files are
+    :param label: What it is called: the scenario, or that it is for more than one
+    """
+
+    scenario: Scenario
+    strategy: str
+    folder: Path
+    label: str
+
+    @property
+    def allocator(self) -> Path:
+        return self.folder / ALLOCATOR_FILE
+
+    @property
+    def router(self) -> Path:
+        return self.folder / ROUTER_FILE
+
+    @property
+    def its_log(self) -> Path | None:
+        """The log of its training, if there is one."""
+        path = self.folder / ITS_LOG
+        return path if path.is_file() else None
+
+
+def read_log(its_log: Path) -> list[dict[str, str]]:
+    """
+    :param its_log: The ``its_log.csv`` of a training
+    :return: Its lines, one for every epoch
+    :raises ValueError: If it is something else; the message names file and line
+    """
+    remedy = f"give the {ITS_LOG} that the training wrote, or take the file away"
+    try:
+        with its_log.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{its_log}: is no log of a training ({error}); {remedy}.") from error
+    for number, row in enumerate(rows, start=2):
+        try:
+            for column, kind in LOG_COLUMNS.items():
+                kind(row[column])
+            # Earlier versions did not write it.
+            float(row.get("generation_seconds") or 0.0)
+            if row["level"] not in LEVELS or not row["phase"] or int(row["n_instances"]) < 1:
+                raise ValueError(f"level {row['level']!r}, phase {row['phase']!r}, n_instances {row['n_instances']}")
+        except KeyError as error:
+            raise ValueError(f"{its_log}: has no column {error}; {remedy}.") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{its_log}, line {number}: is damaged ({error}); {remedy}.") from error
+    return rows
+
+
+class Models:
+    """
+    Finds trained pairs, and trains those that are missing.
+
+    :param scale: The scale
+    :param out: Folder of all results; trained pairs are in ``models`` and, for Table I, in ``timing``
+    :param given: The user's own pairs: ``U4-N80/ITS/allocator.zip`` and ``router.zip`` (and the ``its_log.csv`` of their
+        training, for Table I and Figs. 4 and 5), or, for all sizes of a fleet, ``U4/ITS/...``, or for everything, ``ITS/...``.
+        :data:`STRATEGY_FOLDERS` are the names in place of ``ITS``
+    :param seed: Seed of the trainings
+    :param device: Their device
+    :param num_threads: Threads of torch; its own choice when None, one if there are several jobs
+    :param n_jobs: How many trainings run at once
+    :param training: Whether to train what is missing
+    :raises FileNotFoundError: If ``given`` is no folder
+    """
+
+    def __init__(
+        self,
+        scale: Scale,
+        out: Path,
+        given: Path | None = None,
+        seed: int = 0,
+        device: str = "auto",
+        num_threads: int | None = None,
+        n_jobs: int = 1,
+        training: bool = True,
+    ) -> None:
+        if given is not None and not given.is_dir():
+            raise FileNotFoundError(f"--models {given}: no such folder; give one that holds U4-N80/ITS/{ALLOCATOR_FILE}, ...")
+        self.scale = scale
+        self.out = out
+        self.given = given
+        self.seed = seed
+        self.device = device
+        self.num_threads = 1 if num_threads is None and n_jobs > 1 else num_threads
+        self.n_jobs = n_jobs
+        self.training = training
+
+    def get(self, wanted: Iterable[tuple[Scenario, str]], log_needed: bool = False) -> dict[tuple[Scenario, str], Model]:
+        """
+        :param wanted: Scenarios and strategies
+        :param log_needed: Whether a pair without the log of its training is of no use
+        :return: Their pairs; without those that are missing and may not be trained
+        :raises TrainingError: If a training fails
+        :raises KeyboardInterrupt: If a training is interrupted
+        """
+        return self._find(self.scale.recipe, "models", wanted, log_needed)
+
+    def _find(
+        self, recipe: Recipe, kind: str, wanted: Iterable[tuple[Scenario, str]], log_needed: bool
+    ) -> dict[tuple[Scenario, str], Model]:
+        """The user's own pairs, and those that are trained with a recipe; see :meth:`get`."""
+        found: dict[tuple[Scenario, str], Model] = {}
+        jobs: dict[tuple[Scenario, str], Job] = {}
+        for scenario, strategy in wanted:
+            model = self._given(scenario, strategy)
+            if model is not None and (model.its_log is not None or not log_needed):
+                found[scenario, strategy] = model
+            else:
+                jobs[scenario, strategy] = self._job(recipe, kind, scenario, strategy)
+        return found | self._trained(jobs)
+
+    def timed(self, wanted: Iterable[Scenario]) -> dict[Scenario, Model]:
+        """
+        :param wanted: Scenarios
+        :return: Pairs whose logs tell how long epochs take
+        """
+        recipe = self.scale.timing
+        if recipe is None:
+            trained = [scenario for scenario in wanted if scenario.n_tasks in self.scale.trained_sizes]
+            models = self.get([(scenario, ITS) for scenario in trained], log_needed=True)
+        else:
+            models = self._find(recipe, "timing", [(scenario, ITS) for scenario in wanted], log_needed=True)
+        return {scenario: model for (scenario, _), model in models.items()}
+
+    def _given(self, scenario: Scenario, strategy: str) -> Model | None:
+        """The user's own pair, if there is one."""
+        if self.given is None:
+            return None
+        for part, label in ((scenario.folder, scenario.name), (f"U{scenario.n_uavs}",) * 2, (".", "universal")):
+            model = Model(scenario, strategy, self.given / part / STRATEGY_FOLDERS[strategy], label)
+            if model.allocator.is_file() and model.router.is_file():
+                return model
+            if model.allocator.is_file() or model.router.is_file():
+                missing = ROUTER_FILE if model.allocator.is_file() else ALLOCATOR_FILE
+                raise FileNotFoundError(f"{model.folder / missing}: no such file; --models needs both zips of a pair.")
+        return None
+
+    def _job(self, recipe: Recipe, kind: str, scenario: Scenario, strategy: str) -> Job:
+        place = Path(scenario.folder) / STRATEGY_FOLDERS[strategy]
+        return Job(
+            scenario,
+            strategy,
+            training_entry(self.scale, recipe, scenario, strategy),
+            self.out / "training" / kind / place,
+            self.out / kind / place,
+            self.seed,
+            self.device,
+            self.num_threads,
+        )
+
+    def _trained(self, jobs: dict[tuple[Scenario, str], Job]) -> dict[tuple[Scenario, str], Model]:
+        """Those that are trained, after training what is missing."""
+        todo = [job for job in jobs.values() if not check_complete(job)]
+        if self.training:
+            run_trainings(todo, self.n_jobs)
+            todo = []
+        trained = {key: job for key, job in jobs.items() if job not in todo}
+        return {k: Model(job.scenario, job.strategy, job.model_folder, job.scenario.name) for k, job in trained.items()}
+
+
+def run_trainings(jobs: Sequence[Job], n_jobs: int) -> None:
+    """
+    :param jobs: Trainings
+    :param n_jobs: How many of them to run at once, each in a process of its own if there are several
+    :raises TrainingError: If one fails; those that run are ended, and go on from their last epochs the next time
+    :raises KeyboardInterrupt: If one is interrupted
+    """
+    if n_jobs == 1 or len(jobs) < 2:
+        for position, job in enumerate(jobs):
+            with EpochLines([job], f"training {position + 1} of {len(jobs)}: ") as lines:
+                lines.print(f"{job.title}: begins")
+                train(job)
+        return
+    waiting = deque(jobs)
+    running: dict[int, _Training] = {}
+    try:
+        with EpochLines(jobs, f"{len(jobs)} trainings, {n_jobs} at once: ") as lines:
+            while waiting or running:
+                while waiting and len(running) < n_jobs:
+                    training = _Training.start(waiting.popleft())
+                    lines.print(f"{training.job.title}: begins")
+                    running[training.process.sentinel] = training
+                for sentinel in connection.wait(list(running)):
+                    assert isinstance(sentinel, int)
+                    running.pop(sentinel).check()
+    finally:
+        for training in running.values():
+            training.process.terminate()
+            training.process.join()
+
+
+class _Training(NamedTuple):
+    """
+    A training in a process of its own.
+
+    :param job: The training
+    :param process: The process
+    :param errors: Says what went wrong
+    """
+
+    job: Job
+    process: SpawnProcess
+    errors: connection.Connection
+
+    @classmethod
+    def start(cls, job: Job) -> _Training:
+        context = multiprocessing.get_context("spawn")
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_train_in_process, args=(job, sender), daemon=True)
+        process.start()
+        # The last end to be closed is the process's, so that its death ends the pipe.
+        sender.close()
+        return cls(job, process, receiver)
+
+    def check(self) -> None:
+        """
+        :raises TrainingError: If the training, which is over, failed
+        """
+        self.process.join()
+        if self.process.exitcode != 0:
+            try:
+                message = self.errors.recv()
+            except EOFError:
+                message = f"Training {self.job.title} failed: its process died; was it out of memory?"
+            raise TrainingError(message)
+
+
+def _train_in_process(job: Job, errors: connection.Connection) -> None:
+    # Ctrl-C reaches all processes of a terminal; the main one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        train(job)
+    except Exception as error:
+        errors.send(str(error))
+        raise SystemExit(1) from error
+
+
+class EpochLines:
+    """
+    Prints a line for every epoch that ends while the ``with`` block lasts.
+
+    :param jobs: The trainings
+    :param prefix: What every line begins with
+    """
+
+    def __init__(self, jobs: Sequence[Job], prefix: str) -> None:
+        self.jobs = jobs
+        self.prefix = prefix
+        self._n_lines = {job.title: len(self._lines(job)) for job in jobs}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        # The trainings of this process send theirs into a file.
+        self._stream = sys.stderr
+
+    def __enter__(self) -> EpochLines:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._over.wait(POLL_INTERVAL):
+            self._look()
+        self._look()
+
+    def _look(self) -> None:
+        for job in self.jobs:
+            lines = self._lines(job)
+            for line in lines[self._n_lines[job.title] :]:
+                epoch, level, phase, _, objective, seconds = line.split(",")[:6]
+                n_epochs = f" of {job.n_epochs[1]}" if level == "allocator" else ""
+                text = f"{level} epoch {epoch}{n_epochs} ({phase}): {float(objective):.2f} tasks, {float(seconds):.0f} s"
+                self.print(f"{job.title}: {text}")
+            self._n_lines[job.title] = len(lines)
+
+    @staticmethod
+    def _lines(job: Job) -> list[str]:
+        """The lines of the log of its newest run, without the header."""
+        from sb3_uav.training.its import LOG_FILE
+
+        logs = sorted(job.run_folder.glob(f"reinforce/*/{LOG_FILE}"), key=lambda log: log.stat().st_mtime)
+        return logs[-1].read_text(encoding="utf-8").splitlines()[1:] if logs else []
+
+    def print(self, text: str) -> None:
+        """
+        :param text: What else to say
+        """
+        print(self.prefix + text, file=self._stream, flush=True)

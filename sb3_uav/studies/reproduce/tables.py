@@ -1,0 +1,399 @@
+"""Tables I to IV of the paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from sb3_uav.evaluation.summary import SummaryRow, gaps
+from sb3_uav.solvers.base import Solver
+from sb3_uav.studies.reproduce.measurements import BASELINES, complete
+from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, Model, read_log
+from sb3_uav.studies.reproduce.paper import (
+    EXACT_BLOCK,
+    EXACT_COLUMNS,
+    FULL_BLOCK,
+    FULL_COLUMNS,
+    GREEDY,
+    GUROBI,
+    INDEPENDENT_GREEDY,
+    INDEPENDENT_SAMPLING,
+    INSTANCES_PER_EPOCH,
+    KMEANS_AM,
+    LARGER_METHODS,
+    LARGER_SIZES,
+    MEASURES,
+    PHASES,
+    SAMPLING,
+    SIZES,
+    paper_figure,
+    paper_tables,
+)
+from sb3_uav.studies.reproduce.scales import Scenario, scenarios
+from sb3_uav.studies.reproduce.session import Notes, Session
+from sb3_uav.studies.reproduce.table_files import MISSING, Column, Table, best, number
+
+PAPER, OURS = "paper", "ours"
+FASTEST_SHOWN = 0.1
+
+
+class PhaseTimes(NamedTuple):
+    """
+    Seconds per instance, NaN where the log does not tell.
+
+    :param upper: Of the allocator's epochs
+    :param lower: Of the router's, without the time that went into its instances
+    :param generation: Of making the router's instances
+    :param n_instances: How many instances an epoch has
+    """
+
+    upper: float
+    lower: float
+    generation: float
+    n_instances: int
+
+
+def seconds(value: float | None) -> str:
+    """
+    :param value: A time
+    :return: Text for a cell, with more digits where two would say nothing
+    """
+    return number(value, 2 if value is None or math.isnan(value) or value >= FASTEST_SHOWN else 4)
+
+
+# ---------------------------------------------------------------------------------------------------------------- Table I
+
+
+def table1(session: Session) -> list[Path]:
+    """
+    Time of training per epoch: upper level, lower level, generation of the lower level's data.
+
+    :param session: What to do it with
+    :return: The files
+    """
+    models = session.models.timed(scenarios())
+    groups = [Column(source, phase) for phase in PHASES for source in (PAPER, OURS)]
+    table = Table(f"Table I: {paper_tables()['table1']['caption']}", [Column("Situation"), *groups])
+    notes = Notes(
+        f"Minutes per epoch of {INSTANCES_PER_EPOCH:,} instances. The paper's: one RTX 3090, two from 300 tasks on. Ours are "
+        "measured over fewer instances and multiplied; the first epoch, whose baseline is cheaper, is left out.",
+        "Lower-level and data generation: epochs of the alternate phase, where an epoch's subsets are all generated anew.",
+    )
+    given = session.models.given
+    own = [scenario.name for scenario, model in models.items() if given is not None and model.folder.is_relative_to(given)]
+    if own:
+        notes.add(f"Trainings of the given pairs (--models): {', '.join(own)}.")
+    if session.scale.timing is not None and len(own) < len(models):
+        notes.add(f"Our runs have the paper's networks and baseline, but batches of {_batch_size(session)} instances.")
+    notes.add_stand_ins(session.scale, [])
+    measured: dict[int, list[str]] = {}
+    missing: list[str] = []
+    for scenario in scenarios():
+        if scenario.n_tasks == SIZES[0]:
+            table.start_part()
+        times = phase_times(models[scenario]) if scenario in models else None
+        if times is None:
+            missing.append(scenario.name)
+        else:
+            measured.setdefault(times.n_instances, []).append(scenario.name)
+        cells = [scenario.name]
+        for phase, ours in zip(PHASES, times or (math.nan,) * 3, strict=False):
+            cells += [number(paper_figure("table1", scenario.name, phase)), number(ours * INSTANCES_PER_EPOCH / 60)]
+        table.add(cells)
+    notes.add(*(f"Epochs of {count:,} instances: {', '.join(names)}." for count, names in measured.items()))
+    if missing:
+        notes.add(f"Not trained at scale {session.scale.name}, or without the log of the training: {', '.join(missing)}.")
+    table.notes = [*notes.list(), *paper_tables()["table1"]["faults"]]
+    return session.write_table(table, "table1")
+
+
+def _batch_size(session: Session) -> int:
+    assert session.scale.timing is not None
+    return session.scale.timing.allocator["n_envs"]
+
+
+def phase_times(model: Model) -> PhaseTimes:
+    """
+    :param model: A trained pair with the log of its training
+    :return: How long the phases of an epoch took
+    :raises ValueError: If the log is something else
+    """
+    assert model.its_log is not None
+    rows = read_log(model.its_log)
+    upper = [row for row in rows if row["level"] == "allocator"]
+    upper = upper[1:] or upper
+    alternate = [row for row in rows if row["level"] == "router" and row["phase"] == "alternate"]
+    lower = alternate[1:] or alternate
+    nothing = {"seconds": "nan", "generation_seconds": "nan", "n_instances": "1"}
+    # A log of an earlier version does not tell the generation from the learning.
+    generation = _per_instance(lower or [nothing], "generation_seconds")
+    return PhaseTimes(
+        _per_instance(upper or [nothing], "seconds"),
+        _per_instance(lower or [nothing], "seconds") - generation,
+        generation,
+        int(upper[-1]["n_instances"]) if upper else 0,
+    )
+
+
+def _per_instance(rows: Sequence[Mapping[str, str]], column: str) -> float:
+    total = math.fsum(float(row.get(column) or "nan") for row in rows)
+    return total / sum(int(row["n_instances"]) for row in rows)
+
+
+# -------------------------------------------------------------------------------------------------------- Tables II and III
+
+
+def table2(session: Session) -> list[Path]:
+    """
+    Experiment results with 4 UAVs.
+
+    :param session: What to do it with
+    :return: The files
+    """
+    return _results_table(session, "table2", "Table II", 4)
+
+
+def table3(session: Session) -> list[Path]:
+    """
+    Experiment results with 6 UAVs.
+
+    :param session: What to do it with
+    :return: The files
+    """
+    return _results_table(session, "table3", "Table III", 6)
+
+
+def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list[Path]:
+    """
+    :param session: What to do it with
+    :param name: Of the files and of the paper's data
+    :param title: Its number
+    :param n_uavs: The fleet
+    :return: The files
+    """
+    here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
+    pairs = trained_pairs(session, here)
+    extras = session.extra_solvers
+    blocks = {EXACT_BLOCK: EXACT_COLUMNS, FULL_BLOCK: (*FULL_COLUMNS, *extras)}
+    columns = [Column(column, block) for block, methods in blocks.items() for column in methods]
+    heading = [Column("Number of tasks"), Column("Measure"), Column("Source")]
+    table = Table(f"{title}: {paper_tables()[name]['caption']}", [*heading, *columns])
+    notes = Notes("Gap: to the best method of the same block, in percent. Time: wall time per instance.")
+    notes.add_stand_ins(session.scale, here)
+    _say_how_many(session, notes)
+    errors: list[float] = []
+    for scenario in here:
+        solvers = _solvers(session, scenario, pairs, notes)
+        found = {
+            EXACT_BLOCK: _exact_block(session, scenario, solvers, notes),
+            FULL_BLOCK: _block(session, scenario, {c: s for c, s in solvers.items() if c != GUROBI}, notes),
+        }
+        ours = {block: _measures(found[block], methods) for block, methods in blocks.items()}
+        errors += [row.standard_error for rows in found.values() for row in rows.values()]
+        papers = {
+            block: {
+                measure: [paper_figure(name, str(scenario.n_tasks), block, method, measure) for method in methods]
+                for measure in MEASURES.values()
+            }
+            for block, methods in blocks.items()
+        }
+        table.start_part()
+        for label, measure in MEASURES.items():
+            for source, figures in ((PAPER, papers), (OURS, ours)):
+                cells, bold = [str(scenario.n_tasks), label, source], []
+                for block in blocks:
+                    if measure != "seconds":
+                        bold += [len(cells) + index for index in best(figures[block][measure], smallest=measure == "gap")]
+                    show = seconds if measure == "seconds" and source == OURS else number
+                    cells += [show(value) for value in figures[block][measure]]
+                table.add(cells, bold)
+    _say_how_exact(errors, notes)
+    faults = [f"The paper's table: {fault}" for fault in paper_tables()[name]["faults"]]
+    table.notes = [*notes.list(), *faults]
+    return session.write_table(table, name)
+
+
+def trained_pairs(
+    session: Session, wanted: Sequence[Scenario], strategies: Sequence[str] = (ITS, INDEPENDENT)
+) -> dict[tuple[Scenario, str], Model]:
+    """
+    :param session: Finds or trains them
+    :param wanted: What is to be solved
+    :param strategies: Training strategies
+    :return: The pairs that solve the scenarios; without those that are missing and may not be trained
+    """
+    given = [(scenario, strategy) for scenario in wanted for strategy in strategies]
+    trained = dict.fromkeys((session.scale.trained_for(scenario), strategy) for scenario, strategy in given)
+    return session.models.get(trained)
+
+
+def _solvers(
+    session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
+) -> dict[str, Solver]:
+    """
+    :param session: What to do it with
+    :param scenario: What is to be solved
+    :param pairs: The trained pairs
+    :param notes: What is left out is said there
+    :return: The solvers by their columns
+    """
+    found: dict[str, Solver] = {}
+    trained = session.scale.trained_for(scenario)
+    independent, ours = pairs.get((trained, INDEPENDENT)), pairs.get((trained, ITS))
+    for solver, column in BASELINES.items():
+        if solver not in session.solvers:
+            notes.add(f"{column} was not asked for (--solvers).")
+        elif solver != "kmeans-am":
+            found[column] = session.evaluator.baseline(solver)
+        elif independent is not None:
+            found[column] = session.evaluator.baseline(solver, independent)
+    if KMEANS_AM in found:
+        notes.add(f"{KMEANS_AM} uses the router of DL-DRL-I, which has learned from whole uniform instances only.")
+    for column, model, sampling in (
+        (INDEPENDENT_GREEDY, independent, False),
+        (INDEPENDENT_SAMPLING, independent, True),
+        (GREEDY, ours, False),
+        (SAMPLING, ours, True),
+    ):
+        if model is not None:
+            found[column] = session.evaluator.pair(model, sampling)
+        else:
+            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids to train one.")
+    found |= {solver: session.evaluator.baseline(solver) for solver in session.extra_solvers}
+    return found
+
+
+def _say_how_many(session: Session, notes: Notes) -> None:
+    scale = session.scale
+    counts = ", ".join(f"{scale.n_instances[size]} (N = {size})" for size in SIZES)
+    if len({scale.n_instances[size] for size in SIZES}) == 1:
+        counts = str(scale.n_instances[SIZES[0]])
+    limits = [f"{solver} {scale.time_limits[solver]:g} s" for solver in session.solvers if solver in scale.time_limits]
+    notes.add(f"Ours: {counts} instances in place of 500, {scale.n_exact_instances} in place of 30, {scale.samples} samples.")
+    if limits:
+        notes.add(f"Our time limits per instance: {', '.join(limits)}.")
+
+
+def _say_how_exact(errors: Sequence[float], notes: Notes) -> None:
+    known = [error for error in errors if not math.isnan(error)]
+    if known:
+        notes.add(
+            f"Our instances are not the paper's: the standard errors of our mean objectives go up to {max(known):.2f}. "
+            "Methods of the same block solve the same instances, and can be compared more exactly than that."
+        )
+
+
+def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
+    """What the solvers of the exact block achieve, by their columns."""
+    scale = session.scale
+    chosen = {column: solvers[column] for column in EXACT_COLUMNS if column in solvers}
+    if GUROBI in chosen:
+        notes.add(f"{GUROBI}: ours is the paper's model, equations (1) to (8), solved by {scale.exact_backend}.")
+        if scenario.n_tasks not in scale.exact_sizes:
+            del chosen[GUROBI]
+            left_out = ", ".join(str(size) for size in SIZES if size not in scale.exact_sizes)
+            notes.add(f"The exact solver does not run with {left_out} tasks at scale {scale.name}.")
+    instances = session.evaluator.instances(scenario, n_instances=scale.n_exact_instances)
+    results = session.evaluator.run(scenario, list(chosen.values()), instances, folder="-exact")
+    notes.add(*results.failures)
+    return {column: results.rows[solver.name] for column, solver in chosen.items() if solver.name in results.rows}
+
+
+def _block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
+    """What solvers achieve on the test instances, by their columns."""
+    results = session.evaluator.run(scenario, list(solvers.values()))
+    notes.add(*results.failures)
+    return {column: results.rows[solver.name] for column, solver in solvers.items() if solver.name in results.rows}
+
+
+def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[str, list[float | None]]:
+    """The figures of a block: for every measure one for each method."""
+    objectives = [complete(rows.get(method), lambda row: row.objective) for method in methods]
+    shown = [math.nan if objective is None else objective for objective in objectives]
+    return {
+        "objective": objectives,
+        "gap": list(gaps(shown)),
+        "seconds": [complete(rows.get(method), lambda row: row.seconds) for method in methods],
+    }
+
+
+# --------------------------------------------------------------------------------------------------------------- Table IV
+
+
+def table4(session: Session) -> list[Path]:
+    """
+    Generalisation of pairs trained with 500 tasks to 600 and more.
+
+    :param session: What to do it with
+    :return: The files
+    """
+    here = scenarios(LARGER_SIZES)
+    pairs = trained_pairs(session, here)
+    methods = (*LARGER_METHODS, *session.extra_solvers)
+    columns = [Column(title, f"N={size}") for size in LARGER_SIZES for title in ("Obj.", "Time(s)")]
+    heading = [Column("Fleet"), Column("Method"), Column("Source")]
+    table = Table(f"Table IV: {paper_tables()['table4']['caption']}", [*heading, *columns])
+    labels = dict.fromkeys(model.label for model in pairs.values())
+    notes = Notes(
+        f"DL-DRL and DL-DRL-I: sampling, with the pairs {', '.join(labels) or '(none)'} (the paper's: U4-500, U6-500).",
+        "The paper's table ends at 1000 tasks. Time: wall time per instance.",
+    )
+    notes.add_stand_ins(session.scale, [])
+    counts = ", ".join(f"{session.scale.n_instances[size]} (N = {size})" for size in LARGER_SIZES)
+    notes.add(f"Our instances: {counts}; the paper does not say how many it has.")
+    errors: list[float] = []
+    for n_uavs in dict.fromkeys(scenario.n_uavs for scenario in here):
+        table.start_part()
+        ours = {size: _larger(session, Scenario(n_uavs, size), pairs, notes) for size in LARGER_SIZES}
+        errors += [row.standard_error for rows in ours.values() for row in rows.values()]
+        found = {
+            OURS: {
+                size: {
+                    "objective": [complete(ours[size].get(method), lambda row: row.objective) for method in methods],
+                    "seconds": [complete(ours[size].get(method), lambda row: row.seconds) for method in methods],
+                }
+                for size in LARGER_SIZES
+            },
+            PAPER: {
+                size: {
+                    measure: [paper_figure("table4", f"U{n_uavs}", str(size), method, measure) for method in methods]
+                    for measure in ("objective", "seconds")
+                }
+                for size in LARGER_SIZES
+            },
+        }
+        for position, method in enumerate(methods):
+            for source in (PAPER, OURS):
+                if source == PAPER and method in session.extra_solvers:
+                    continue
+                cells, bold = [f"U{n_uavs}", method, source], []
+                for size in LARGER_SIZES:
+                    figures = found[source][size]
+                    for measure in ("objective", "seconds"):
+                        show = seconds if measure == "seconds" and source == OURS else number
+                        if position in best(figures[measure], measure == "seconds", show):
+                            bold.append(len(cells))
+                        cells.append(show(figures[measure][position]))
+                table.add(cells, [column for column in bold if cells[column] != MISSING])
+    _say_how_exact(errors, notes)
+    table.notes = [*notes.list(), *paper_tables()["table4"]["faults"]]
+    return session.write_table(table, "table4")
+
+
+def _larger(
+    session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
+) -> dict[str, SummaryRow]:
+    """What the methods of Table IV achieve, by their names."""
+    columns = {"DL-DRL-I": INDEPENDENT_SAMPLING, "DL-DRL": SAMPLING}
+    all_solvers = _solvers(session, scenario, pairs, Notes())
+    solvers = {
+        method: all_solvers[column]
+        for method in (*LARGER_METHODS, *session.extra_solvers)
+        if (column := columns.get(method, method)) in all_solvers
+    }
+    for method in LARGER_METHODS:
+        if method not in solvers:
+            notes.add(f"{method} was not asked for (--solvers), or --no-training forbids to train its pair.")
+    return _block(session, scenario, solvers, notes)

@@ -1,0 +1,129 @@
+"""The files that an interrupted imitation goes on from."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+
+from sb3_uav.common.files import write_atomically
+from sb3_uav.envs.instances import Instances
+from sb3_uav.policies import RouterPolicy
+
+INSTANCE_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
+
+
+class Lesson(NamedTuple):
+    """
+    Subsets and good tours through them.
+
+    :param instances: ``batch`` single-UAV instances
+    :param tours: ``(batch, n_steps)`` int64 nodes, padded with the depot
+    """
+
+    instances: Instances
+    tours: th.Tensor
+
+
+class ImitationProgress:
+    """
+    Lessons and updates so far, as plain tensors: nothing in the files is executed when they are read.
+
+    :param folder: Where the files are, or are going to be
+    :param settings: Of the imitation; the files must have been written with the same, and for the same generator and seed
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self.folder = folder
+        self.settings = dict(settings)
+        self._n_chunks = 0
+
+    def save_lessons(self, lessons: list[Lesson], rng: np.random.Generator) -> None:
+        """
+        :param lessons: New ones
+        :param rng: What they were drawn from
+        :raises OSError: If the file cannot be written
+        """
+        # Copies, because torch saves all that a view is a part of.
+        content = [
+            {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in INSTANCE_FIELDS}
+            for lesson in lessons
+        ]
+        self._write(self._chunk_file(), rng, {"lessons": content})
+        self._n_chunks += 1
+
+    def restore_lessons(self, rng: np.random.Generator) -> list[Lesson]:
+        """
+        :param rng: Goes on where it was when the last ones were saved
+        :return: All that were saved
+        :raises ValueError: If a file is damaged or belongs to other settings
+        """
+        lessons: list[Lesson] = []
+        while (content := self._read(self._chunk_file(), rng)) is not None:
+            for fields in content["lessons"]:
+                tours = fields.pop("tours")
+                lessons.append(Lesson(Instances(n_uavs=1, **fields), tours))
+            self._n_chunks += 1
+        return lessons
+
+    def save_updates(
+        self, n_updates: int, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator
+    ) -> None:
+        """
+        :param n_updates: How many were made
+        :param router: What has learned
+        :param optimizer: Its optimizer
+        :param rng: What chose the lessons
+        :raises OSError: If the file cannot be written
+        """
+        learned = {"n_updates": n_updates, "router": router.state_dict(), "optimizer": optimizer.state_dict()}
+        self._write(self.folder / "updates.pt", rng, learned)
+
+    def restore_updates(self, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator) -> int:
+        """
+        :param router: Gets what was learned
+        :param optimizer: Gets its state
+        :param rng: Goes on where it was
+        :return: How many updates were made
+        :raises ValueError: If the file is damaged or belongs to other settings or another network
+        """
+        path = self.folder / "updates.pt"
+        content = self._read(path, rng)
+        if content is None:
+            return 0
+        try:
+            router.load_state_dict(content["router"])
+            optimizer.load_state_dict(content["optimizer"])
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"{path}: of another network ({error}); remove {self.folder} to begin anew.") from error
+        return content["n_updates"]
+
+    def _chunk_file(self) -> Path:
+        return self.folder / f"lessons_{self._n_chunks}.pt"
+
+    def _write(self, path: Path, rng: np.random.Generator, content: dict[str, Any]) -> None:
+        stream = io.BytesIO()
+        th.save({"settings": self.settings, "rng": json.dumps(rng.bit_generator.state), **content}, stream)
+        write_atomically(path, stream.getvalue())
+
+    def _read(self, path: Path, rng: np.random.Generator) -> dict[str, Any] | None:
+        if not path.is_file():
+            return None
+        stored = io.BytesIO(path.read_bytes())
+        try:
+            content = th.load(stored, map_location="cpu", weights_only=True)
+            state, settings = json.loads(content["rng"]), content["settings"]
+        except Exception as error:
+            # Torch raises all kinds of them.
+            raise ValueError(f"{path}: not an intact file ({error}); remove {self.folder} to begin anew.") from error
+        if settings != self.settings:
+            raise ValueError(
+                f"{path}: belongs to an imitation with {settings}, not {self.settings}; remove {self.folder} to begin anew."
+            )
+        rng.bit_generator.state = state
+        return content
