@@ -22,9 +22,12 @@ from hypothesis import strategies as st
 from sb3_uav.common.files import file_hash
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
-from sb3_uav.evaluation import results
+from sb3_uav.evaluation import folder as evaluation_folder
+from sb3_uav.evaluation import provenance
 from sb3_uav.evaluation.parallel import Failure, Runner
-from sb3_uav.evaluation.results import RESULT_COLUMNS, instances_hash, locked_folder
+from sb3_uav.evaluation.locking import locked_folder
+from sb3_uav.evaluation.provenance import instances_hash
+from sb3_uav.evaluation.results import RESULT_COLUMNS
 from sb3_uav.evaluation.run import evaluate, find_reference
 from sb3_uav.evaluation.summary import SummaryRow
 from sb3_uav.solvers import OneByOneSolver, Solution, Solver, SolverResult, make_solver
@@ -408,9 +411,9 @@ def test_changed_versions_are_said(
     evaluate([Stub()], instances, tmp_path)
     evaluate([Stub()], instances, tmp_path, resume=True)
     assert caplog.messages == []
-    machine = results.describe_machine()
+    machine = provenance.describe_machine()
     newer = {**machine, "versions": {**machine["versions"], "torch": "99.0", "pyvrp": "1.0"}}
-    monkeypatch.setattr(results, "describe_machine", lambda: newer)
+    monkeypatch.setattr(evaluation_folder, "describe_machine", lambda: newer)
     evaluate([Stub()], instances, tmp_path, resume=True)
     assert "torch " in caplog.text and "-> 99.0" in caplog.text and "pyvrp" in caplog.text
 

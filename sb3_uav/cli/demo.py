@@ -80,7 +80,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     from sb3_uav.plots.schedule_map import MapPanel, plot_schedules
     from sb3_uav.policies import AllocatorPolicy, RouterPolicy
     from sb3_uav.policies.loading import load_policy
-    from sb3_uav.solvers.base import Solver, make_solver
+    from sb3_uav.solvers import Solver, make_solver
     from sb3_uav.solvers.dl_drl import DLDRL
     from sb3_uav.training.its import LOG_FILE
 
