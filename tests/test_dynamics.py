@@ -30,7 +30,8 @@ from sb3_uav.envs import (
     split_tasks,
 )
 from sb3_uav.envs.allocation import UNASSIGNED, AllocationDynamics
-from sb3_uav.envs.problem import Dynamics, Episodes, Problem
+from sb3_uav.envs.episodes import Episodes
+from sb3_uav.envs.problem import Dynamics, Problem
 from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingState
 
 # Ways of adding up the legs of a tour, which differ in their last bits.

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import ClusteredGenerator, FixedGenerator, InstanceGenerator, Instances, UniformGenerator
-from sb3_uav.envs.instances import make_generator
+from sb3_uav.envs.generators import make_generator
 
 FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 DRAWERS = [

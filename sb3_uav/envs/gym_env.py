@@ -7,8 +7,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Episodes, Problem, given_instance
+from sb3_uav.envs.problem import Problem
 
 
 class ProblemEnv(gym.Env[Any, Any]):

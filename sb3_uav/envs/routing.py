@@ -9,8 +9,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_uav.envs.distances import distance_limit, euclidean
+from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.envs.instances import InstanceGenerator, Instances, distance_limit, euclidean, make_generator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem
 
 DEPOT = 0
