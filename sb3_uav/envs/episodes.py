@@ -62,15 +62,8 @@ class Episodes:
         if self.state is None or len(indices) == self.n_envs:
             self.instances = fresh
         else:
-            kept = self.instances
             index = th.from_numpy(indices)
-            self.instances = Instances(
-                **{
-                    name: getattr(kept, name).index_copy(0, index, getattr(fresh, name))
-                    for name in ("depot", "tasks", "values", "max_distance", "task_mask")
-                },
-                n_uavs=kept.n_uavs,
-            )
+            self.instances = self.instances.replace_rows(index, fresh)
         self.dynamics = self.problem.dynamics(self.instances)
         initial = self.dynamics.reset()
         if self.state is None or len(indices) == self.n_envs:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,11 @@ import numpy as np
 import torch as th
 
 from sb3_uav.common.files import temporary_name
+from sb3_uav.common.npz import read_npz
 from sb3_uav.envs.distances import distance_limit, euclidean
 
-# What numpy and zipfile raise on damaged files: the last on headers that ask for encryption or an unknown compression.
-UNREADABLE = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError)
+# The tensors of Instances. Digests are taken in this order, and files of results store digests.
+TENSOR_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,27 +185,31 @@ class Instances:
             row = int(rows) % len(self)
             rows = slice(row, row + 1)
         index: Any = th.as_tensor(rows, device=self.device) if not isinstance(rows, slice | th.Tensor) else rows
-        return replace(
-            self,
-            depot=self.depot[index],
-            tasks=self.tasks[index],
-            values=self.values[index],
-            max_distance=self.max_distance[index],
-            task_mask=self.task_mask[index],
-        )
+        return self._map(lambda field: field[index])
 
     def to(self, device: th.device | str) -> Instances:
         """Copy to ``device``; returns ``self`` when it is there already."""
         if self.device == th.device(device):
             return self
-        return replace(
-            self,
-            depot=self.depot.to(device),
-            tasks=self.tasks.to(device),
-            values=self.values.to(device),
-            max_distance=self.max_distance.to(device),
-            task_mask=self.task_mask.to(device),
-        )
+        return self._map(lambda field: field.to(device))
+
+    def _map(self, function: Callable[[th.Tensor], th.Tensor]) -> Instances:
+        """Apply a function to every tensor."""
+        fields: dict[str, Any] = {name: function(getattr(self, name)) for name in TENSOR_FIELDS}
+        return replace(self, **fields)
+
+    def replace_rows(self, rows: th.Tensor, others: Instances) -> Instances:
+        """
+        Put other instances of the same size in the place of some rows.
+
+        :param rows: ``(n,)`` int64, the rows to replace
+        :param others: ``n`` instances
+        :return: A copy with the other instances in these rows
+        """
+        fields: dict[str, Any] = {
+            name: getattr(self, name).index_copy(0, rows, getattr(others, name)) for name in TENSOR_FIELDS
+        }
+        return replace(self, **fields)
 
     def trim(self, n_tasks: int) -> Instances:
         """Keep the first ``n_tasks`` task slots of every row."""
@@ -252,14 +256,21 @@ class Instances:
             raise ValueError(f"Cannot join instances with different n_uavs: {sorted(fleets)}.")
         n_tasks = max(part.n_tasks for part in parts)
         padded = [part.pad(n_tasks) for part in parts]
-        return Instances(
-            depot=th.cat([part.depot for part in padded]),
-            tasks=th.cat([part.tasks for part in padded]),
-            values=th.cat([part.values for part in padded]),
-            max_distance=th.cat([part.max_distance for part in padded]),
-            n_uavs=fleets.pop(),
-            task_mask=th.cat([part.task_mask for part in padded]),
-        )
+        fields: dict[str, Any] = {name: th.cat([getattr(part, name) for part in padded]) for name in TENSOR_FIELDS}
+        return replace(padded[0], **fields)
+
+    def digest(self, header: str | None = None) -> str:
+        """
+        SHA-256 of the contents, by which equal instances are recognized.
+
+        :param header: What is hashed before the tensors; number of UAVs, batch size and number of tasks when None
+        :return: 64 hexadecimal digits
+        """
+        header = f"{self.n_uavs} {tuple(self.task_mask.shape)}\n" if header is None else header
+        digest = hashlib.sha256(header.encode())
+        for name in TENSOR_FIELDS:
+            digest.update(getattr(self, name).cpu().numpy().tobytes())
+        return digest.hexdigest()
 
     def home_distance(self) -> th.Tensor:
         """Distance of every task to its depot, ``(batch, n_tasks)`` float64."""
@@ -298,12 +309,7 @@ class Instances:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
-        try:
-            # Not np.load(path), which would also read a .npy or offer to unpickle whatever else it finds.
-            with path.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except UNREADABLE as error:
-            raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); write it again.") from error
+        arrays = read_npz(path, "write it again")
         missing = {"depot", "tasks", "max_distance", "n_uavs"} - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")

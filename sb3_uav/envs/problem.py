@@ -79,6 +79,21 @@ class Problem(ABC):
         self.action_space = self._action_space()
         self.observation_space = spaces.Dict({**self._static_spaces(), **self._dynamic_spaces()})
 
+    def set_generator(self, generator: InstanceGenerator) -> None:
+        """
+        Draw the instances from another source of the same size.
+
+        :param generator: The new source
+        :raises ValueError: If its instances do not fit the observation space
+        """
+        old, new = self.generator, generator
+        if (new.n_tasks, new.n_uavs) != (old.n_tasks, old.n_uavs):
+            raise ValueError(
+                f"The new generator draws {new.n_tasks} tasks and {new.n_uavs} UAVs, the environment was made for "
+                f"{old.n_tasks} and {old.n_uavs}; make a new environment."
+            )
+        self.generator = generator
+
     @abstractmethod
     def _action_space(self) -> spaces.Discrete: ...
 
