@@ -13,7 +13,7 @@ from typing import Any
 
 from sb3_uav.common.files import replaced_when_complete, write_csv
 from sb3_uav.envs.instances import Instances
-from sb3_uav.evaluation.provenance import describe_machine, describe_solver, instances_hash
+from sb3_uav.evaluation.provenance import describe_machine, describe_solver
 from sb3_uav.evaluation.results import (
     FAILED,
     RESULT_COLUMNS,
@@ -71,7 +71,7 @@ class EvaluationFolder:
         settings: dict[str, Any] = {
             "format": FORMAT,
             "instances": [
-                {"name": name, "n_instances": len(batch), "sha256": instances_hash(batch)} for name, batch in sources.items()
+                {"name": name, "n_instances": len(batch), "sha256": batch.digest()} for name, batch in sources.items()
             ],
             "solvers": {solver.name: describe_solver(solver) for solver in solvers},
             "runs": [{**run, **describe_machine()}],

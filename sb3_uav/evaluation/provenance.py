@@ -1,8 +1,7 @@
-"""Where results come from: the instances, the solver, the versions and the machine."""
+"""Where results come from: the solver, the versions of packages, and the machine."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -11,22 +10,10 @@ from typing import Any
 
 import sb3_uav
 from sb3_uav.common.files import file_hash
-from sb3_uav.envs.instances import Instances
 from sb3_uav.solvers.base import Solver
 
 # Packages whose version may change what a solver finds.
 PACKAGES = ("torch", "numpy", "stable-baselines3", "scipy", "numba", "ortools", "pyvrp", "highspy", "gurobipy")
-
-
-def instances_hash(instances: Instances) -> str:
-    """
-    :param instances: Instances on the CPU
-    :return: SHA-256 of all that they hold
-    """
-    digest = hashlib.sha256(f"{instances.n_uavs} {tuple(instances.task_mask.shape)}\n".encode())
-    for name in ("depot", "tasks", "values", "max_distance", "task_mask"):
-        digest.update(getattr(instances, name).contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def describe_solver(solver: Solver) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import torch as th
 from sb3_uav.envs.allocation import plan_tours
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
-from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
+from sb3_uav.envs.symmetries import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.solvers.shortlists import Block
 
