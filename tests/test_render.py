@@ -12,10 +12,7 @@ from env_helpers import act, batched_env, both_levels, env_fns, legal_actions, m
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_uav.common.optional import install_command
-from sb3_uav.envs import (
-    BatchedVecEnv,
-    RoutePlanningEnv,
-)
+from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv
 
 
 @both_levels
