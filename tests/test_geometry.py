@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
-from sb3_uav.policies.encoder import StaticObservation
 from sb3_uav.policies.geometry import (
     FARTHEST,
     FULL,
-    N_NEIGHBOURS,
+    N_NEIGHBORS,
     N_NEXT,
     NEAR,
     FleetGeometry,
@@ -24,6 +23,7 @@ from sb3_uav.policies.geometry import (
     node_features,
     scaled_coordinates,
 )
+from sb3_uav.policies.static_observation import StaticObservation
 
 
 def static_of(instances: Instances) -> StaticObservation:
@@ -121,16 +121,16 @@ def test_features_of_a_fleet() -> None:
 
 @settings(max_examples=50)
 @given(instances=instance_batches())
-def test_neighbours_come_before_the_task_and_are_nearest(instances: Instances) -> None:
+def test_neighbors_come_before_the_task_and_are_nearest(instances: Instances) -> None:
     geometry = FleetGeometry.of(static_of(instances))
     for row in range(len(instances)):
         points = geometry.tasks[row].tolist()
         for task in range(int(instances.task_mask[row].sum())):
-            known = geometry.neighbour_distance[row, task] < FARTHEST
-            assert (geometry.neighbours[row, task][known] < task).all()
+            known = geometry.neighbor_distance[row, task] < FARTHEST
+            assert (geometry.neighbors[row, task][known] < task).all()
             all_before = sorted(min(math.dist(points[task], points[other]), FARTHEST) for other in range(task))
-            expected = [distance for distance in all_before[:N_NEIGHBOURS] if distance < FARTHEST - 1e-6]
-            found = [distance for distance in geometry.neighbour_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
+            expected = [distance for distance in all_before[:N_NEIGHBORS] if distance < FARTHEST - 1e-6]
+            found = [distance for distance in geometry.neighbor_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
             assert found == pytest.approx(expected, abs=1e-5)
 
 

@@ -32,7 +32,7 @@ from sb3_uav.envs.instances import Instances, training_batch
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
-from sb3_uav.policies.base import Cache
+from sb3_uav.policies.extractor import Cache
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -16,14 +16,12 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
-from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained import pair_files
 from sb3_uav.solvers.limits import deadline_after
 from sb3_uav.solvers.network_solver import BatchedSolver, parameters_hash
 from sb3_uav.solvers.postprocess import Refinement
-
-PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
 DECODINGS = ("greedy", "sampling", "augment")
 # Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
@@ -41,19 +39,6 @@ N_VIEWS = N_DIRECTIONS * N_SYMMETRIES
 N_REVISITED, REVISITED_PART = 4, 0.25
 # Under a time limit less is done between two looks at the clock. Twice as many views overran one second at 1,000 tasks.
 HURRIED_BLOCK, HURRIED_VIEWS = 16, 2
-
-
-def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
-    """
-    :param policy: Any policy of ours
-    :param seed: Of the new parameters; the global random state is left as it was
-    :return: A policy of the same architecture that has learned nothing, on the same device
-    """
-    with th.random.fork_rng(devices=[]):
-        th.default_generator.manual_seed(seed)
-        fresh = type(policy)(**policy._get_constructor_parameters())
-    fresh.set_training_mode(False)
-    return fresh.to(policy.device)
 
 
 class DLDRL(BatchedSolver):
@@ -118,7 +103,7 @@ class DLDRL(BatchedSolver):
         :param seed: Of the parameters
         :return: The same solver with networks of the same architecture that have learned nothing
         """
-        allocator, router = freshly_initialised(self.allocator, seed), freshly_initialised(self.router, seed + 1)
+        allocator, router = self.allocator.untrained_copy(seed), self.router.untrained_copy(seed + 1)
         name = f"DL-DRL untrained{f' {seed}' if seed else ''} ({self._decoding})"
         refinement = (self.refinement.repair, self.refinement.polish, self.time_limit)
         return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name, *refinement)
