@@ -19,7 +19,7 @@ from sb3_uav.envs.sweep import sweep_order
 from sb3_uav.policies.base import EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import feed_forward
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
-from sb3_uav.policies.geometry import FleetFeature, FleetGeometry, FleetState
+from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
 

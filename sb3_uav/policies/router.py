@@ -17,7 +17,7 @@ from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, Routing
 from sb3_uav.policies.base import EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import attend
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
-from sb3_uav.policies.geometry import MoveFeature, MoveGeometry
+from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
 
