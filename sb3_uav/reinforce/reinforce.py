@@ -33,7 +33,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
-from sb3_uav.policies.base import Cache
+from sb3_uav.policies.extractor import Cache
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 
 SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")

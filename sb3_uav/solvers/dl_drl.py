@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, TypeVar
-
-import torch as th
+from typing import Any
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained import pair_files
 from sb3_uav.solvers.decoding import DECODINGS, SAMPLE_BLOCK, Decoder
@@ -19,21 +17,6 @@ from sb3_uav.solvers.limits import deadline_after
 from sb3_uav.solvers.network_solver import BatchedSolver, parameters_hash
 from sb3_uav.solvers.postprocess import Refinement
 from sb3_uav.solvers.shortlists import Shortlists
-
-PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
-
-
-def freshly_initialised(policy: PolicyT, seed: int) -> PolicyT:
-    """
-    :param policy: Any policy of ours
-    :param seed: Of the new parameters; the global random state is left as it was
-    :return: A policy of the same architecture that has learned nothing, on the same device
-    """
-    with th.random.fork_rng(devices=[]):
-        th.default_generator.manual_seed(seed)
-        fresh = type(policy)(**policy._get_constructor_parameters())
-    fresh.set_training_mode(False)
-    return fresh.to(policy.device)
 
 
 class DLDRL(BatchedSolver):
@@ -98,7 +81,7 @@ class DLDRL(BatchedSolver):
         :param seed: Of the parameters
         :return: The same solver with networks of the same architecture that have learned nothing
         """
-        allocator, router = freshly_initialised(self.allocator, seed), freshly_initialised(self.router, seed + 1)
+        allocator, router = self.allocator.untrained_copy(seed), self.router.untrained_copy(seed + 1)
         name = f"DL-DRL untrained{f' {seed}' if seed else ''} ({self._decoding})"
         refinement = (self.refinement.repair, self.refinement.polish, self.time_limit)
         return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name, *refinement)
