@@ -19,7 +19,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     Train a pair with all phases of the ITS, evaluate it beside simple heuristics, draw learning curves and a schedule.
 
     :param argv: Command line arguments; those of the process when None
-    :return: Exit code
+    :return: Exit code: 1 if a schedule was infeasible
+    :raises ValueError: If an argument is wrong
+    :raises OSError: If a file cannot be read or written
+    :raises ImportError: If a package that the demo needs is not installed
     """
     parser = argparse.ArgumentParser(prog="sb3-uav demo", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder of all results (default: %(default)s)")
@@ -28,10 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     args, train_args = parser.parse_known_args(argv)
 
-    from sb3_uav.zoo import train
+    from sb3_uav.zoo.train import train
 
     logs = args.out / "logs"
-    code = train.main(
+    train(
         [
             *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
             *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
@@ -42,13 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             *train_args,
         ]
     )
-    if code != 0:
-        return code
-    try:
-        return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
-    except (ValueError, FileNotFoundError, ImportError) as error:
-        print(f"sb3-uav demo: {error}", file=sys.stderr)
-        return 2
+    return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
 
 
 def newest_run(folder: Path, env_id: str) -> Path:
@@ -141,7 +138,3 @@ def print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> No
             error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else float("nan")
             relative = gain.mean() / objectives[other].mean()
             print(f"{name} against {other}: {gain.mean():+.2f} tasks ({relative:+.1%}), standard error {error:.2f}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

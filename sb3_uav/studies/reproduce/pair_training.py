@@ -89,7 +89,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     :return: The zoo's YAML entry of the scenario with the changes of the recipe
     :raises FileNotFoundError: If the zoo's YAML is missing
     """
-    from sb3_uav.zoo.experiment import default_config, plain_numbers
+    from sb3_uav.zoo.configs import default_config, plain_numbers
 
     config = default_config("reinforce")
     if config is None:
