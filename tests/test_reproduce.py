@@ -23,11 +23,10 @@ from PIL import Image
 from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.studies.reproduce import command
-from sb3_uav.studies.reproduce.figures import read_curves
-from sb3_uav.studies.reproduce.measurements import Evaluator
-from sb3_uav.studies.reproduce.pair_training import Job, TrainingError, train, training_entry
-from sb3_uav.studies.reproduce.pairs import ITS, Model, Models, _train_in_process, _Training, run_trainings
+from sb3_uav.studies.reproduce.evaluator import Evaluator
+from sb3_uav.studies.reproduce.figures_3_to_7 import read_curves
+from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
+from sb3_uav.studies.reproduce.pairs import ITS, Model, Models
 from sb3_uav.studies.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
@@ -40,8 +39,10 @@ from sb3_uav.studies.reproduce.paper import (
     paper_tables,
 )
 from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
-from sb3_uav.studies.reproduce.table_files import Column, Table, best, to_csv, to_latex, to_markdown
-from sb3_uav.studies.reproduce.tables import phase_times, seconds
+from sb3_uav.studies.reproduce.table_formats import Column, Table, best, to_csv, to_latex, to_markdown
+from sb3_uav.studies.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.studies.reproduce.targets import TARGETS
+from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
 
 pytest.importorskip("rl_zoo3")
 
@@ -302,7 +303,7 @@ def threads() -> Iterator[None]:
 
 @pytest.mark.slow
 def test_every_file_says_where_it_comes_from(out: Path) -> None:
-    for name in command.TARGETS:
+    for name in TARGETS:
         for suffix in (".md", ".tex", ".csv"):
             text = (out / f"{name}{suffix}").read_text()
             for part in ("sb3-uav reproduce all --scale smoke", "Seed: 0", "Scale: smoke", "torch 2.", "X. Mao"):
@@ -486,7 +487,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def no_licence(spec: str, **_: Any) -> Any:
         raise ValueError(f"{spec}: no licence")
 
-    monkeypatch.setattr("sb3_uav.studies.reproduce.measurements.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.studies.reproduce.evaluator.make_solver", no_licence)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")
@@ -495,10 +496,10 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert expected in comments and "solved by gurobi" in "".join(comments)
 
 
-def job(folder: Path, strategy: str = ITS, **its: Any) -> Job:
+def job(folder: Path, strategy: str = ITS, **its: Any) -> PairTraining:
     entry = training_entry(SMOKE, SMOKE.recipe, Scenario(4, 80), strategy)
     entry["callback"][0]["sb3_uav.training.ITSCallback"].update(its)
-    return Job(Scenario(4, 80), strategy, entry, folder / "training", folder / "models" / strategy, 0, "cpu", 1)
+    return PairTraining(Scenario(4, 80), strategy, entry, folder / "training", folder / "models" / strategy, 0, "cpu", 1)
 
 
 @pytest.mark.slow
@@ -516,11 +517,11 @@ def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr(ITSCallback, "_end_epoch", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train(job(tmp_path))
+            train_pair(job(tmp_path))
     assert not (tmp_path / "models").exists()
     with pytest.raises(TrainingError, match="holds an unfinished training with other settings; delete it"):
-        train(job(tmp_path, n_epochs=5))
-    train(job(tmp_path))
+        train_pair(job(tmp_path, n_epochs=5))
+    train_pair(job(tmp_path))
     for name in ("allocator.zip", "router.zip"):
         resumed, unbroken = load_policy(tmp_path / "models/ITS" / name), load_policy(out / "models/U4-N80/ITS" / name)
         assert all(th.equal(value, resumed.state_dict()[key]) for key, value in unbroken.state_dict().items()), name
@@ -537,7 +538,7 @@ def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_trainings_in_parallel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     jobs = [job(tmp_path / str(index), strategy, n_epochs=1) for index, strategy in enumerate((ITS, "independent"))]
-    run_trainings(jobs, 2)
+    train_pairs(jobs, 2)
     assert all((j.model_folder / "allocator.zip").is_file() and (j.model_folder / "its_log.csv").is_file() for j in jobs)
     assert "2 trainings, 2 at once: U4-80, independent: allocator epoch 1 of 1" in capsys.readouterr().err
 
@@ -547,7 +548,7 @@ def test_a_failed_training_says_where_to_look(tmp_path: Path) -> None:
     broken = job(tmp_path)
     broken.entry["learning_rat"] = 1.0
     with pytest.raises(TrainingError, match=r"Training U4-80, ITS failed: .*did you mean 'learning_rate'.*output\.txt"):
-        train(broken)
+        train_pair(broken)
 
 
 @pytest.mark.slow
@@ -558,12 +559,12 @@ def test_a_failed_process_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     receiver, sender = multiprocessing.Pipe(duplex=False)
     with monkeypatch.context() as patch, pytest.raises(SystemExit):
         patch.setattr(signal, "signal", lambda *_: None)
-        _train_in_process(broken, sender)
+        train_in_process(broken, sender)
     with pytest.raises(TrainingError, match=r"failed: .*did you mean 'learning_rate'"):
-        _Training(broken, over, receiver).check()  # type: ignore[arg-type]
+        TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
     sender.close()
     with pytest.raises(TrainingError, match="U4-80, ITS failed: its process died; was it out of memory"):
-        _Training(broken, over, receiver).check()  # type: ignore[arg-type]
+        TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from sb3_uav.training.its import read_state
 
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli
-from sb3_uav.cli.demo import evaluate_run, newest_run
+from sb3_uav.studies.demo import evaluate_run, newest_run
 from sb3_uav.zoo import enjoy, train
 from sb3_uav.zoo.configs import default_config, parse_schedule, plain_numbers
 
