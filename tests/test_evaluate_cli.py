@@ -81,7 +81,7 @@ def user_error(capsys: pytest.CaptureFixture[str], *arguments: Any) -> str:
     capsys.readouterr()
     assert run(*arguments) == 2
     captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("sb3-uav: error: ")]
+    lines = [line for line in captured.err.splitlines() if line.startswith("sb3-uav evaluate: error: ")]
     assert len(lines) == 1 and "Traceback" not in captured.err and captured.out == ""
     return lines[0]
 
@@ -236,7 +236,7 @@ def test_going_on_after_ctrl_c(
     assert run(*common, "halting") == 130
     message = capsys.readouterr().err
     assert f"{tmp_path} holds the results so far; the same command goes on from there" in message
-    assert message.endswith("sb3-uav: interrupted\n")
+    assert message.endswith("sb3-uav evaluate: interrupted\n")
     before = (tmp_path / "results.csv").read_text()
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
 

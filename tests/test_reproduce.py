@@ -16,6 +16,7 @@ from typing import Any
 import matplotlib.image
 import pytest
 import torch as th
+from its_logs import LOG
 from PIL import Image
 
 from sb3_uav.cli import main as cli
@@ -38,15 +39,6 @@ from sb3_uav.studies.reproduce.targets import TARGETS
 from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
 
 pytest.importorskip("rl_zoo3")
-
-LOG = """\
-epoch,level,phase,n_instances,objective,seconds,generation_seconds
-1,router,pre-training,100,9.5,6.0,0.0
-1,allocator,alternate,100,30.0,12.0,0.0
-2,router,alternate,100,8.0,5.0,1.0
-2,allocator,alternate,100,31.0,18.0,0.0
-3,router,alternate,50,8.0,6.0,2.0
-"""
 
 
 def read_table(path: Path) -> tuple[list[str], list[dict[str, str]], list[str]]:

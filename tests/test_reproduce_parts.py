@@ -9,58 +9,43 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from its_logs import LOG
 
 from sb3_uav.evaluation.summary import gaps
+from sb3_uav.studies.reproduce import paper
 from sb3_uav.studies.reproduce.evaluator import Evaluator
 from sb3_uav.studies.reproduce.figures_3_to_7 import read_curves
 from sb3_uav.studies.reproduce.pair_training import training_entry
 from sb3_uav.studies.reproduce.pairs import ITS, Model
-from sb3_uav.studies.reproduce.paper import (
-    EXACT_COLUMNS,
-    FULL_COLUMNS,
-    LARGER_METHODS,
-    LARGER_SIZES,
-    MEASURES,
-    PHASES,
-    SIZES,
-    paper_figure,
-    paper_tables,
-)
+from sb3_uav.studies.reproduce.paper import paper_figure, paper_tables
 from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
 from sb3_uav.studies.reproduce.table_formats import Column, Table, best, to_csv, to_latex, to_markdown
 from sb3_uav.studies.reproduce.tables_1_to_4 import phase_times, seconds
 
 pytest.importorskip("rl_zoo3")
 
-LOG = """\
-epoch,level,phase,n_instances,objective,seconds,generation_seconds
-1,router,pre-training,100,9.5,6.0,0.0
-1,allocator,alternate,100,30.0,12.0,0.0
-2,router,alternate,100,8.0,5.0,1.0
-2,allocator,alternate,100,31.0,18.0,0.0
-3,router,alternate,50,8.0,6.0,2.0
-"""
-
 
 # ------------------------------------------------------------------------------------------------------- the paper's figures
 
 
 def test_every_figure_of_the_paper_is_there() -> None:
-    assert [paper_figure("table1", s.name, phase) for s in scenarios() for phase in PHASES].count(None) == 0
+    assert [paper_figure("table1", s.name, phase) for s in scenarios() for phase in paper.PHASES].count(None) == 0
     for table in ("table2", "table3"):
         rows = paper_tables()[table]["rows"]
-        assert list(rows) == [str(size) for size in SIZES]
+        assert list(rows) == [str(size) for size in paper.SIZES]
         for row in rows.values():
             assert {block: tuple(methods) for block, methods in row.items()} == {
-                "30 instances": EXACT_COLUMNS,
-                "500 instances": FULL_COLUMNS,
+                "30 instances": paper.EXACT_COLUMNS,
+                "500 instances": paper.FULL_COLUMNS,
             }
-            assert all(set(figures) == set(MEASURES.values()) for methods in row.values() for figures in methods.values())
+            assert all(
+                set(figures) == set(paper.MEASURES.values()) for methods in row.values() for figures in methods.values()
+            )
     rows = paper_tables()["table4"]["rows"]
     assert {fleet: list(sizes) for fleet, sizes in rows.items()} == {
-        fleet: [str(size) for size in LARGER_SIZES[:5]] for fleet in ("U4", "U6")
+        fleet: [str(size) for size in paper.LARGER_SIZES[:5]] for fleet in ("U4", "U6")
     }
-    assert all(tuple(methods) == LARGER_METHODS for sizes in rows.values() for methods in sizes.values())
+    assert all(tuple(methods) == paper.LARGER_METHODS for sizes in rows.values() for methods in sizes.values())
 
 
 @pytest.mark.parametrize(
@@ -107,24 +92,24 @@ def test_the_copied_cells_are_named() -> None:
 
 
 def test_untrained_sizes_are_solved_by_the_nearest_pair() -> None:
-    assert [SMOKE.trained_for(Scenario(6, size)).n_tasks for size in SIZES] == [80, 80, 200, 200, 200, 200]
-    assert [PAPER.trained_for(Scenario(4, size)).n_tasks for size in (*SIZES, 600, 1500)] == [*SIZES, 500, 500]
+    assert [SMOKE.trained_for(Scenario(6, size)).n_tasks for size in paper.SIZES] == [80, 80, 200, 200, 200, 200]
+    assert [PAPER.trained_for(Scenario(4, size)).n_tasks for size in (*paper.SIZES, 600, 1500)] == [*paper.SIZES, 500, 500]
 
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=str)
 def test_scales_are_complete(scale: Any) -> None:
-    assert set(scale.n_instances) == {*SIZES, *LARGER_SIZES}
-    assert set(scale.exact_sizes) | set(scale.trained_sizes) <= set(SIZES)
+    assert set(scale.n_instances) == {*paper.SIZES, *paper.LARGER_SIZES}
+    assert set(scale.exact_sizes) | set(scale.trained_sizes) <= set(paper.SIZES)
     assert scale is PAPER or all(0 < scale.time_limits[name] <= 60 for name in ("milp", "ortools-gls", "pyvrp"))
 
 
 def test_training_entries() -> None:
     """At the paper's scale the zoo's own entry, at the others the changes of the recipe, at every level."""
-    paper = training_entry(PAPER, PAPER.recipe, Scenario(6, 300), ITS)
-    its = paper["callback"][0]["sb3_uav.training.ITSCallback"]
-    assert (paper["n_envs"], paper["instances_per_epoch"], paper["learning_rate"]) == (256, 1_280_000, 1e-4)
+    entry = training_entry(PAPER, PAPER.recipe, Scenario(6, 300), ITS)
+    its = entry["callback"][0]["sb3_uav.training.ITSCallback"]
+    assert (entry["n_envs"], entry["instances_per_epoch"], entry["learning_rate"]) == (256, 1_280_000, 1e-4)
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
-    assert paper["n_timesteps"] >= 100 * 1_280_000 * 300
+    assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
     cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), "ITS/intensive")
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (cpu["instances_per_epoch"], cpu["baseline"], its["router"]["baseline"]) == (320, "shared", "shared")

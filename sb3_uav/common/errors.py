@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 OK, USER_ERROR, INTERRUPTED = 0, 2, 130
 
@@ -24,3 +24,16 @@ def run_command(prog: str, function: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[[Sequence[str] | None], int]:
+    """
+    :param prog: Name of a command
+    :param function: Takes its arguments
+    :return: Its main function, which takes the arguments of the process when they are None, and returns an exit code
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        return run_command(prog, lambda: function(list(sys.argv[1:] if argv is None else argv)))
+
+    return main

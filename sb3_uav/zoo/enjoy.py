@@ -11,24 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
-from sb3_uav.common.errors import run_command
+from sb3_uav.common.errors import main_function
 
 PROG = "sb3-uav enjoy"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Replay a trained agent; every flag of ``rl_zoo3.enjoy`` works.
-
-    :param argv: Command line arguments; those of the process when None
-    :return: Exit code, see :func:`~sb3_uav.common.errors.run_command`
-    """
-    return run_command(PROG, partial(enjoy, sys.argv[1:] if argv is None else argv))
-
-
 def enjoy(arguments: Sequence[str]) -> None:
     """
-    The same, with exceptions in place of exit codes.
+    Replay a trained agent; every flag of ``rl_zoo3.enjoy`` works.
 
     :param arguments: Command line arguments
     :raises ValueError: If there is no such agent, or another argument is wrong
@@ -95,6 +85,9 @@ def _create_test_env(create_test_env: Any, model: str | None, router: Path | Non
         print(f"Rewards come from the router {router}")
     return env
 
+
+# For ``python -m sb3_uav.zoo.enjoy``, with exit codes in place of exceptions.
+main = main_function(PROG, enjoy)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -5,28 +5,17 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
-from sb3_uav.common.errors import run_command
+from sb3_uav.common.errors import main_function
 
 PROG = "sb3-uav train"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works.
-
-    :param argv: Command line arguments; those of the process when None
-    :return: Exit code, see :func:`~sb3_uav.common.errors.run_command`
-    """
-    return run_command(PROG, partial(train, sys.argv[1:] if argv is None else argv))
-
-
 def train(arguments: Sequence[str]) -> None:
     """
-    The same, with exceptions in place of exit codes.
+    Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works.
 
     :param arguments: Command line arguments
     :raises ValueError: If an argument or the YAML is wrong
@@ -59,6 +48,9 @@ def train(arguments: Sequence[str]) -> None:
         except OSError as error:
             raise OSError(f"could not write: {error}. Earlier files are intact.") from error
 
+
+# For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.
+main = main_function(PROG, train)
 
 if __name__ == "__main__":
     sys.exit(main())
