@@ -26,7 +26,7 @@ def run_command(prog: str, function: Callable[[], int | None]) -> int:
         return INTERRUPTED
 
 
-def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[[Sequence[str] | None], int]:
+def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:
     """
     :param prog: Name of a command
     :param function: Takes its arguments
