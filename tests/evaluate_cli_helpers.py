@@ -64,7 +64,7 @@ def user_error(capsys: pytest.CaptureFixture[str], *arguments: Any) -> str:
     capsys.readouterr()
     assert run(*arguments) == 2
     captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("sb3-uav: error: ")]
+    lines = [line for line in captured.err.splitlines() if line.startswith("sb3-uav evaluate: error: ")]
     assert len(lines) == 1 and "Traceback" not in captured.err and captured.out == ""
     return lines[0]
 

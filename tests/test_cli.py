@@ -52,4 +52,4 @@ def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsy
     assert cli.main([command]) == 0
     assert received == [["--help", "-f", "x", "three"], []]
     assert cli.main([command, "fail"]) == 2
-    assert capsys.readouterr().err == "sb3-uav: error: no such file\n"
+    assert capsys.readouterr().err == f"sb3-uav {command}: error: no such file\n"

@@ -30,7 +30,7 @@ def test_going_on_after_ctrl_c(
     assert run(*common, "halting") == 130
     message = capsys.readouterr().err
     assert f"{tmp_path} holds the results so far; the same command goes on from there" in message
-    assert message.endswith("sb3-uav: interrupted\n")
+    assert message.endswith("sb3-uav evaluate: interrupted\n")
     before = (tmp_path / "results.csv").read_text()
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
 

@@ -13,14 +13,9 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.folder import EvaluationFolder
 from sb3_uav.evaluation.locking import locked_folder
 from sb3_uav.evaluation.parallel import Failure, Runner
-from sb3_uav.evaluation.results import RESULTS_FILE, SCHEDULES_FILE
 from sb3_uav.evaluation.set_evaluation import Progress, SetEvaluation
 from sb3_uav.evaluation.summary import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarise, write_summary
-from sb3_uav.evaluation.table import print_table
 from sb3_uav.solvers.base import Solver
-from sb3_uav.solvers.unavailable import UnavailableSolver
-
-__all__ = ["RESULTS_FILE", "SCHEDULES_FILE", "SummaryRow", "UnavailableSolver", "evaluate", "find_reference", "print_table"]
 
 logger = logging.getLogger(__name__)
 
