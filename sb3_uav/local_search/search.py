@@ -69,7 +69,9 @@ class LocalSearch:
         :param seed: Of the random numbers
         :return: What kernels work on
         """
-        n_uavs, n_tasks = self.instance.n_uavs, len(self._tasks)
+        n_tasks = len(self._tasks)
+        # More UAVs than tasks are of no use, and each costs memory.
+        n_uavs = max(min(self.instance.n_uavs, self.instance.n_tasks), len(schedule.routes))
         nodes = self._nodes.copy()
         nodes["owner"] = -1
         state = np.zeros(1, kernels.STATE)
