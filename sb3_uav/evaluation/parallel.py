@@ -152,6 +152,11 @@ class Runner:
         self._pool: ProcessPoolExecutor | None = None
         self._context = _RecordingContext()
 
+    @property
+    def processes(self) -> list[SpawnProcess]:
+        """The processes of the pool that is in use."""
+        return [] if self._pool is None else self._context.processes
+
     def __enter__(self) -> Runner:
         return self
 

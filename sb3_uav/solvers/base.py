@@ -66,10 +66,10 @@ class Solver(ABC):
     spec: str | None = None
     files: Mapping[str, Path] = {}
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any] | None:
         """
         :return: What decides its results beside instances, time limit and seed, as plain data; results of earlier evaluations
-            are used again only if it is the same
+            are used again only if it is the same. None for a solver that has no results
         """
         return {} if self.spec is None else {"spec": self.spec}
 
