@@ -110,7 +110,7 @@ def test_mapping_back(batch: Instances, seed: int) -> None:
         assert th.equal(counting.instances.values[row, :n_tasks], batch.values[row, counts])
         schedule = counting.schedule(row, Schedule([range(n_tasks)]))
         assert [task for route in schedule.routes for task in route] == counts
-        assert len(schedule.routes) == max(min(batch.n_uavs, int(batch.task_mask[row].sum())), 1)
+        assert len(schedule.routes) == batch.n_uavs
     counting.instances.validate()
 
 
@@ -131,7 +131,7 @@ def test_absurd_fleets_cost_no_memory(spec: str, n_uavs: int, ticks: Ticks) -> N
     tracemalloc.stop()
     assert peak < 50e6
     for row, result in enumerate(results):
-        assert len(result.schedule.routes) == 5
+        assert len(result.schedule.routes) == 1000
         assert check_schedule(batch, row, result.schedule).objective >= (3 if spec == "random-nearest" else 5)
 
 
@@ -140,7 +140,7 @@ def test_a_fleet_that_is_larger_than_the_number_of_tasks_depends_on_no_other_row
     batch = Instances.concatenate([UniformGenerator(n, 6, 9.0)(2, np.random.default_rng(n)) for n in (2, 9, 4)])
     for solver in (make_pair(6), make_pair(6, decode="sampling", samples=4, batch_size=1), make_kmeans_am()):
         together = routes(solver, batch)
-        assert [len(found) for found in together] == [2, 2, 6, 6, 4, 4]
+        assert all(len(found) == 6 for found in together)
         assert [routes(solver, batch[row : row + 1])[0] for row in range(2)] == together[:2]
         found = dict(solver.solve_rows(batch, [5, 2, 0]))
         assert {row: result.schedule.routes for row, result in found.items()} == {row: together[row] for row in (5, 2, 0)}

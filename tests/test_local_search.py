@@ -344,7 +344,9 @@ def test_kmeans_vnd_gains() -> None:
         results = make_solver(name).solve(batch, seed=5)
         value[name] = np.mean([rank(batch[row], result.schedule)[0] for row, result in enumerate(results)])
         for row, result in enumerate(results):
-            clusters = kmeans(batch.tasks[row].numpy(), 4, np.random.default_rng([5, row]))
+            in_reach = np.flatnonzero(batch.reachable()[row])
+            clusters = np.full(200, -1)
+            clusters[in_reach] = kmeans(batch.tasks[row, in_reach].numpy(), 4, np.random.default_rng([5, row]))
             for uav, route in enumerate(result.schedule.routes):
                 assert (clusters[list(route)] == uav).all()
     assert value["kmeans-vnd"] > 1.1 * value["kmeans-nearest"]

@@ -10,6 +10,9 @@ import torch as th
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 
+# Schedules list all UAVs of a fleet up to this size; of a larger one, idle UAVs are left out.
+LARGEST_LISTED_FLEET = 1000
+
 
 @dataclass(frozen=True)
 class CountingTasks:
@@ -56,18 +59,19 @@ class CountingTasks:
         """
         :param row: Row of an instance
         :param found: A schedule of what counts of it
-        :return: The schedule of the original instance, with one route for each UAV, or for as many UAVs as there are tasks if
-            that is fewer. It is at least as good as visiting the most valuable tasks one by one: where the solver found less,
-            it is just that
+        :return: The schedule of the original instance, with one route for each UAV, but not for more than
+            :data:`LARGEST_LISTED_FLEET` or than there are tasks. It is at least as good as visiting the most valuable tasks
+            one by one: where the solver found less, it is just that
         """
-        n_routes = min(self.original.n_uavs, int(self.original.task_mask[row].sum()))
+        n_useful = min(self.original.n_uavs, int(self.original.task_mask[row].sum()))
+        n_routes = min(self.original.n_uavs, max(n_useful, LARGEST_LISTED_FLEET))
         tasks = self.index[row].tolist()
         n_tasks = int(self.instances.task_mask[row].sum())
         if any(not 0 <= task < n_tasks for route in found.routes for task in route):
             # A faulty schedule stays what it is, for the checker to refuse.
             return found
         values = self.instances.values[row].tolist()
-        single = sorted(range(n_tasks), key=lambda task: -values[task])[:n_routes]
+        single = sorted(range(n_tasks), key=lambda task: -values[task])[:n_useful]
         if math.fsum(values[task] for route in found.routes for task in route) < math.fsum(values[task] for task in single):
             found = Schedule([[task] for task in single])
         routes = [[tasks[task] for task in route] for route in found.routes]

@@ -46,7 +46,7 @@ class KMeansAM(BatchedSolver):
     def solve_batch(
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
-        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED)
+        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
         for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
             if n_tasks > 0:
                 points = instances.tasks[i, :n_tasks].numpy()
