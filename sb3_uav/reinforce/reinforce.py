@@ -26,7 +26,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.instances import Instances, training_batch
 from sb3_uav.envs.problem import Problem
@@ -156,7 +156,7 @@ class REINFORCE(OnPolicyAlgorithm):
         self.lr_decay = lr_decay
         self.normalize_advantage = normalize_advantage
         # All that a resumed run needs to go on as if it had not been interrupted.
-        self.stream_seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        self.stream_seed = draw_seed() if seed is None else seed
         self.baseline_state: dict[str, Any] = {}
         self.baseline_policy: EpisodicPolicy | None = None
         self.n_batches = 0
