@@ -6,10 +6,8 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.distributions import MaskableDistribution
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
@@ -22,6 +20,7 @@ from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
 
 # Hidden size of the scorer.
 SCORER_DIM = 64
@@ -53,7 +52,7 @@ class AllocatorCache(Cache):
 class AllocatorState(NamedTuple):
     """
     :param context: ``(batch, n_samples, n_uavs, embed_dim)``, element-wise maximum of the embeddings of the depot and of the
-        UAV's tasks (paper, equation (16))
+        UAV's tasks (paper, equation (15))
     :param task: ``(batch, n_samples)`` int64, the task to allocate
     :param features: ``(batch, n_samples, n_uavs, len(FleetFeature))``, how the task fits to each UAV; None without geometry
     """
@@ -103,9 +102,9 @@ class SharedScorer(nn.Module):
 
 class AllocatorExtractor(EpisodicExtractor):
     """
-    Features = [task subset embedding, embedding of the current task] (paper, equations (16) to (18)).
+    Features = [task subset embedding, embedding of the current task] (paper, equations (15) to (17)).
 
-    With ``net_arch=[]`` on top, SB3's action layer is the paper's last equation (19).
+    With ``net_arch=[]`` on top, SB3's action layer and the softmax are the paper's equation (18).
     With ``shared_scorer`` they are [score of every UAV, embedding of the current task], and the scores are the logits.
 
     :param observation_space: Observation space of a ``TaskAllocation`` environment
@@ -117,6 +116,7 @@ class AllocatorExtractor(EpisodicExtractor):
     environment = "TaskAllocation"
     own_key = "assignment"
 
+    @float32_on_cpu()
     def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
         network = NetworkSettings.of(settings)
         n_uavs, embed_dim = self.n_actions(observation_space), network.embed_dim
@@ -234,14 +234,12 @@ class AllocatorPolicy(EpisodicPolicy):
         """The ``task_order`` of the environments that suit it."""
         return "sweep" if self.sweep else "input"
 
-    def _decode_observation(
-        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
-    ) -> tuple[MaskableDistribution, th.Tensor]:
-        if self.sweep and not self._order_is_checked:
+    def _decode_observation(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        if self.sweep and not self._order_is_checked and not is_recorded():
             self._order_is_checked = True
             assert isinstance(obs, dict)
             self._check_order(StaticObservation.from_observation(obs))
-        return super()._decode_observation(obs, action_masks)
+        return super()._decode_observation(obs)
 
     def _check_order(self, static: StaticObservation) -> None:
         """Warn if the tasks of the first observations are not in the order that the allocator wants."""

@@ -28,6 +28,7 @@ from sb3_uav.policies.grouping import EPISODE_INDEX
 from sb3_uav.policies.memory import rows_that_fit
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
 
 SelfPolicy = TypeVar("SelfPolicy", bound="EpisodicPolicy")
 
@@ -87,6 +88,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     extractor_class: ClassVar[type[EpisodicExtractor]]
     features_extractor: EpisodicExtractor
 
+    @float32_on_cpu()
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -279,13 +281,10 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
 
     # ---------------------------------------------------------------------------------------------------- SB3's step loop
 
-    def _decode_observation(
-        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
-    ) -> tuple[MaskableDistribution, th.Tensor]:
+    def _decode_observation(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param obs: ``batch`` observations
-        :param action_masks: The mask of each; that of the observation when None
-        :return: The masked distribution, and the values ``(batch,)``
+        :return: Unmasked logits ``(batch, n_actions)``, values ``(batch,)``
         """
         assert isinstance(obs, dict)
         # The index is no part of the observation space, which preprocessing goes through.
@@ -294,36 +293,82 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         assert isinstance(preprocessed, dict)
         if EPISODE_INDEX in obs:
             preprocessed[EPISODE_INDEX] = obs[EPISODE_INDEX]
-        features = self.features_extractor(preprocessed)
-        logits, values = self._heads(features)
+        return self._heads(self.features_extractor(preprocessed))
+
+    def _mask(self, obs: PyTorchObs, logits: th.Tensor, action_masks: np.ndarray | th.Tensor | None) -> th.Tensor:
+        """
+        :param obs: ``batch`` observations
+        :param logits: ``(batch, n_actions)``
+        :param action_masks: The mask of each; that of the observation when None
+        :return: ``(batch, n_actions)`` bool
+        :raises ValueError: If a row has no legal action
+        """
+        assert isinstance(obs, dict)
+        given = obs["action_mask"] if action_masks is None else action_masks
+        mask = th.as_tensor(given, dtype=th.bool, device=logits.device).reshape(logits.shape)
+        if is_recorded():
+            return mask
+        legal = mask.any(-1)
+        if not legal.all():
+            rows = (~legal).nonzero()[:, 0].tolist()
+            source = 'observation["action_mask"]' if action_masks is None else "action_masks"
+            raise ValueError(
+                f"{source} allows no action in row {rows[0]} ({len(rows)} of {len(legal)} rows); set at least one entry of "
+                "each row to 1, and reset an environment whose episode is over before asking for its next action."
+            )
+        return mask
+
+    def _distribution(
+        self, obs: PyTorchObs, logits: th.Tensor, action_masks: np.ndarray | th.Tensor | None
+    ) -> MaskableDistribution:
+        """
+        :param obs: ``batch`` observations
+        :param logits: ``(batch, n_actions)``
+        :param action_masks: The mask of each; that of the observation when None
+        :return: The masked distribution
+        :raises ValueError: If a row has no legal action
+        """
+        mask = self._mask(obs, logits, action_masks)
         distribution = self.action_dist.proba_distribution(action_logits=logits)
-        distribution.apply_masking(obs["action_mask"].bool() if action_masks is None else action_masks)
-        return distribution, values
+        distribution.apply_masking(mask)
+        return distribution
 
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        distribution, values = self._decode_observation(obs, action_masks)
+        logits, values = self._decode_observation(obs)
+        if is_recorded():
+            # torch's distributions look at the numbers to validate them, which cannot be exported.
+            masked = logits.masked_fill(~self._mask(obs, logits, action_masks), -th.inf)
+            actions = sample_actions(masked, deterministic, None)
+            return actions, values[:, None], masked.log_softmax(-1).gather(-1, actions[:, None])[:, 0]
+        distribution = self._distribution(obs, logits, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         return actions, values[:, None], distribution.log_prob(actions)
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        distribution, values = self._decode_observation(obs, action_masks)
+        logits, values = self._decode_observation(obs)
+        distribution = self._distribution(obs, logits, action_masks)
         return values[:, None], distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, obs: PyTorchObs, action_masks: np.ndarray | None = None) -> MaskableDistribution:
-        return self._decode_observation(obs, action_masks)[0]
+        return self._distribution(obs, self._decode_observation(obs)[0], action_masks)
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
-        return self._decode_observation(obs, None)[1][:, None]
+        return self._decode_observation(obs)[1][:, None]
+
+    def masked_logits(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: ``batch`` observations
+        :return: ``(batch, n_actions)``, -inf where an action is illegal
+        :raises ValueError: If a row has no legal action
+        """
+        logits = self._decode_observation(obs)[0]
+        return logits.masked_fill(~self._mask(obs, logits, None), -th.inf)
 
     # ---------------------------------------------------------------------------------------------------- parameters
-
-    def load_from_vector(self, vector: np.ndarray) -> None:
-        self.features_extractor.clear_cache()
-        super().load_from_vector(vector)
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, th.Tensor], policy_kwargs: dict[str, Any], device: Any) -> Any:

@@ -11,6 +11,7 @@ from torch.nn import functional
 from sb3_uav.policies.geometry import NodeFeature, node_features, scaled_coordinates
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import is_recorded
 
 # The strongest preference for near nodes that a head starts with: e^-1 at 1/16 of the maximum flight distance.
 LOCALITY = 256.0
@@ -84,14 +85,15 @@ class NodeNorm(nn.Module):
             return self.norm(nodes, node_mask)
         if not isinstance(self.norm, nn.BatchNorm1d):
             return self.norm(nodes)
-        if node_mask is None:
+        if node_mask is None or not self.norm.training:
+            # In evaluation mode no node has an influence on another.
             return self.norm(nodes.flatten(0, 1)).view_as(nodes)
         return nodes.masked_scatter(node_mask[..., None], self.norm(nodes[node_mask]))
 
 
 class SelfAttention(nn.Module):
     """
-    Multi-head self-attention without biases (paper, equations (11) to (13)).
+    Multi-head self-attention without biases (paper, equations (10) to (12)).
 
     :param embed_dim: Size of the embeddings
     :param n_heads: Number of heads
@@ -183,7 +185,7 @@ def feed_forward(embed_dim: int, ff_dim: int) -> nn.Sequential:
 
 class AttentionLayer(nn.Module):
     """
-    Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (14), (15)).
+    Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (13) and (14)).
 
     :param settings: Shape of the network
     """
@@ -244,7 +246,8 @@ class AttentionEncoder(nn.Module):
             features = th.cat([features, static.values[..., None]], dim=-1)
         nodes = th.cat([self.embed_depot(depot)[:, None], self.embed_task(features)], dim=1)
         node_mask, attention_bias = None, None
-        if not static.task_mask.all():
+        # A recording must serve padded instances too.
+        if is_recorded() or not static.task_mask.all():
             node_mask = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)
             attention_bias = th.zeros_like(node_mask, dtype=th.float32).masked_fill(~node_mask, -th.inf)[:, None, None]
         # Sums and norms stay in float32.

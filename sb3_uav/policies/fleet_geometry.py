@@ -193,7 +193,8 @@ class FleetGeometry(NamedTuple):
         distance = self.neighbor_distance.gather(1, index)[:, :, None]
         theirs = (owners[:, :, None] == uavs) & (distance < FARTHEST)
         nearest = th.where(theirs, distance, FARTHEST).amin(-1)
-        votes = theirs.sum(-1) / theirs.any(2).sum(-1, keepdim=True).clamp(min=1)
+        # Integers divided by integers would have torch's default dtype.
+        votes = theirs.sum(-1).to(nearest.dtype) / theirs.any(2).sum(-1, keepdim=True).clamp(min=1)
 
         per_task = n_uavs / self.n_real[..., None]
         load = (fleet.n_tasks + 1) * per_task

@@ -77,8 +77,8 @@ def task_distances(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     """
     tasks = coordinates[:, 1:]
     distance = euclidean(tasks[:, :, None], tasks[:, None]).clamp(max=FARTHEST)
-    distance = distance.masked_fill(~task_mask[:, None], FARTHEST)
-    return distance.diagonal_scatter(distance.new_full(task_mask.shape, FARTHEST), dim1=1, dim2=2)
+    itself = th.eye(task_mask.shape[1], dtype=th.bool, device=task_mask.device)
+    return distance.masked_fill(~task_mask[:, None] | itself, FARTHEST)
 
 
 def smallest(distance: th.Tensor, n_smallest: int) -> th.Tensor:

@@ -20,8 +20,9 @@ from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu
 
-# Logits are clipped to +-10 (paper, equation of u; Bello et al.).
+# Compatibilities are clipped to +-10 (C in the paper's equation (22), after Bello et al.).
 LOGIT_CLIP = 10.0
 # What the compatibilities get from the geometry of a move before training: twice as far away is 2^4 times less likely. Tours
 # then begin as those of a randomized nearest neighbor search.
@@ -107,7 +108,7 @@ class MoveBias(nn.Module):
 
 class RouterExtractor(EpisodicExtractor):
     """
-    Features = [clipped compatibilities of the depot and of every task, glimpse] (paper, section IV-B).
+    Features = [clipped compatibilities of the depot and of every task, glimpse] (paper, equations (20) to (22)).
 
     The compatibilities are the logits of :class:`RouterPolicy`; other policies may build on the features as they like.
 
@@ -120,6 +121,7 @@ class RouterExtractor(EpisodicExtractor):
     environment = "RoutePlanning"
     own_key = "position"
 
+    @float32_on_cpu()
     def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
         network = NetworkSettings.of(settings)
         embed_dim, n_heads = network.embed_dim, network.n_heads
