@@ -14,7 +14,7 @@ from typing import TypeVar
 import torch as th
 from torch.nn import functional
 
-from sb3_uav.envs.instances import euclidean
+from sb3_uav.envs.distances import euclidean
 from sb3_uav.policies.static_observation import StaticObservation
 
 # Beyond this nothing can be reached, so where exactly a task lies does not matter, nor does the magnitude of the numbers.

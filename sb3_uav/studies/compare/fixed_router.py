@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.instances import InstanceGenerator, Instances
+from sb3_uav.envs.generators import InstanceGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
@@ -27,6 +29,7 @@ RECIPE: dict[str, Any] = dict(
 )
 
 
+@dataclass(frozen=True)
 class DividedSubsets:
     """
     Single-UAV subsets of instances that are divided without an allocator: half of them at random, as an untrained one does,
@@ -35,11 +38,12 @@ class DividedSubsets:
     :param generator: Draws the instances of the fleet
     """
 
-    n_uavs = 1
+    generator: InstanceGenerator
+    n_uavs: ClassVar[int] = 1
 
-    def __init__(self, generator: InstanceGenerator) -> None:
-        self.generator = generator
-        self.n_tasks = generator.n_tasks
+    @property
+    def n_tasks(self) -> int:
+        return self.generator.n_tasks
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
