@@ -106,7 +106,8 @@ def optimize(policy, other, optimizer_class: Any = th.optim.SGD, **kwargs):
     """In evaluation mode, as a training loop of one's own may."""
     optimizer = optimizer_class(policy.parameters(), lr=0.01, **kwargs)
     with th.enable_grad():
-        tensor = obs_as_tensor(make_vec("allocator" if isinstance(policy, AllocatorPolicy) else "router").reset(), CPU)
+        level = "allocator" if isinstance(policy, AllocatorPolicy) else "router"
+        tensor: Any = obs_as_tensor(make_vec(level).reset(), CPU)
         values, log_prob, _ = policy.evaluate_actions(tensor, tensor["action_mask"].argmax(1))
         (values.sum() - log_prob.sum()).backward()
     optimizer.step()

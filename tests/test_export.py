@@ -117,9 +117,8 @@ def test_onnx(level: str, tmp_path: Path) -> None:
     exportable = make_exportable(level, "default", "action")
     names, shapes = exportable.input_names, exportable.dynamic_shapes
     example = exportable.example_inputs()
-    th.onnx.export(
-        exportable, example, tmp_path / "policy.onnx", input_names=names, output_names=["action"], dynamic_shapes=shapes
-    )
+    kwargs: dict[str, Any] = dict(input_names=names, output_names=["action"], dynamic_shapes=shapes, dynamo=True)
+    th.onnx.export(exportable, example, tmp_path / "policy.onnx", **kwargs)
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     # The exporter leaves out inputs that the network does not use.
     used = {value.name for value in session.get_inputs()}

@@ -89,7 +89,8 @@ def test_stock_ppo_trains_with_float64_as_default() -> None:
     th.set_default_dtype(th.float64)
     try:
         kwargs: dict[str, Any] = dict(n_steps=7, batch_size=14, n_epochs=1, policy_kwargs=SMALL, device="cpu")
-        model = PPO(AllocatorPolicy, make_vec("allocator"), **kwargs)
+        policy: Any = AllocatorPolicy
+        model = PPO(policy, make_vec("allocator"), **kwargs)
         model.learn(28)
         assert {parameter.dtype for parameter in model.policy.parameters()} == {th.float32}
     finally:

@@ -11,10 +11,12 @@ As in SB3's guide to exporting models, but with one input per key of the observa
         input_names=exportable.input_names,
         output_names=["action"],
         dynamic_shapes=exportable.dynamic_shapes,
+        dynamo=True,
     )
 
-Every call encodes its instances; encodings that are kept from earlier calls never become a part of the export. The number of
-tasks is that of the observation space; smaller instances are padded with ``task_mask``, as in the environments.
+The default exporter of ``th.onnx`` needs ``pip install onnxscript``. Every call of the exported network encodes its instances;
+encodings kept from earlier calls never become part of it. The number of tasks is that of the observation space; smaller
+instances are padded with ``task_mask``, as in the environments. Masks without a legal action are not noticed there.
 """
 
 from __future__ import annotations

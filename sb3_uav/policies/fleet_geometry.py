@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum, auto
+from enum import IntEnum
 from typing import NamedTuple
 
 import torch as th
@@ -27,31 +27,23 @@ FULL = 0.95
 LOG_TASKS_PER_UAV_OFFSET = 3.0
 
 
-class FleetFeature(IntEnum):
-    """Features of a task and a UAV in the allocator. The weights in existing zips depend on this order."""
-
+# Features of a task and a UAV in the allocator. The weights in existing zips depend on this order.
+FleetFeature = IntEnum(
+    "FleetFeature",
     # Tasks that the UAV would have, in fair shares; what exceeds FULL of that; and whether it has none yet.
-    LOAD = 0
-    OVERLOAD = auto()
-    EMPTY = auto()
+    "LOAD OVERLOAD EMPTY "
     # Which part of the task's neighbors the UAV has; the distance to the nearest of them, relative to the nearest of any UAV.
-    VOTES = auto()
-    RELATIVE_DISTANCE = auto()
-    NEAREST = auto()
+    "VOTES RELATIVE_DISTANCE NEAREST "
     # Distances to the centroid of the UAV's tasks and to the last of them.
-    CENTROID = auto()
-    LAST = auto()
+    "CENTROID LAST "
     # Half the perimeter of the box around its tasks and the depot, and what the task adds to that.
-    PERIMETER = auto()
-    GROWTH = auto()
+    "PERIMETER GROWTH "
     # Cosine of the angle between task and centroid, seen from the depot.
-    TOWARDS = auto()
+    "TOWARDS "
     # The same for all UAVs: distance to the depot, progress, tasks per UAV, fleet size, and UAVs without tasks.
-    HOME = auto()
-    PROGRESS = auto()
-    TASKS_PER_UAV = auto()
-    FLEET_SIZE = auto()
-    N_EMPTY = auto()
+    "HOME PROGRESS TASKS_PER_UAV FLEET_SIZE N_EMPTY",
+    start=0,
+)
 
 
 class FleetState(NamedTuple):

@@ -8,7 +8,7 @@ Factors and offsets bring each feature to a magnitude of about 1 where D = 2 on 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import IntEnum, auto
+from enum import IntEnum
 from typing import TypeVar
 
 import torch as th
@@ -33,17 +33,12 @@ LOG_DENSITY_OFFSET = 3.0
 LOG_RATIO_LIMIT = 5.0
 
 
-class NodeFeature(IntEnum):
-    """Features of a task in the encoder. The weights in existing zips depend on this order."""
-
-    X = 0
-    Y = auto()
-    HOME = auto()
-    HOME_SQUARED = auto()
-    DIRECTION_X = auto()
-    DIRECTION_Y = auto()
-    NEAREST = auto()
-    DENSITY = auto()
+# Features of a task in the encoder. The weights in existing zips depend on this order.
+NodeFeature = IntEnum(
+    "NodeFeature",
+    "X Y HOME HOME_SQUARED DIRECTION_X DIRECTION_Y NEAREST DENSITY",
+    start=0,
+)
 
 
 FeatureT = TypeVar("FeatureT", bound=IntEnum)
