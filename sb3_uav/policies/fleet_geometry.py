@@ -1,4 +1,4 @@
-"""Measures of how a task fits to the UAVs of a fleet, as inputs of the allocator."""
+"""Measures of how a task fits the UAVs of a fleet, as inputs of the allocator."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sb3_uav.policies.static_observation import StaticObservation
 
 # How many of the nearest earlier tasks count as the neighbors of a task.
 N_NEIGHBORS = 8
-# From which part of its share of the tasks on a UAV counts as full.
+# Fraction of its share of the tasks from which a UAV counts as full.
 FULL = 0.95
 # Logarithm of about 20, a common number of tasks per UAV.
 LOG_TASKS_PER_UAV_OFFSET = 3.0
@@ -64,7 +64,7 @@ class FleetState(NamedTuple):
 
 class FleetGeometry(NamedTuple):
     """
-    What the allocator needs to measure how a task fits to the UAVs.
+    Precomputed distances for the features of tasks and UAVs.
 
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param neighbors: ``(batch, n_tasks, n_neighbors)`` int64, the nearest tasks of a task among those before it
@@ -77,6 +77,11 @@ class FleetGeometry(NamedTuple):
     neighbor_distance: th.Tensor
     n_real: th.Tensor
 
+    @property
+    def tasks(self) -> th.Tensor:
+        """``(batch, n_tasks, 2)``."""
+        return self.coordinates[:, 1:]
+
     @classmethod
     def of(cls, static: StaticObservation) -> FleetGeometry:
         """:param static: ``batch`` instances"""
@@ -86,11 +91,6 @@ class FleetGeometry(NamedTuple):
         distance = task_distances(coordinates, static.task_mask).masked_fill(later, 2 * FARTHEST)
         near, neighbors = distance.topk(min(N_NEIGHBORS, n_tasks), largest=False)
         return cls(coordinates, neighbors, near, static.task_mask.sum(1, keepdim=True).clamp(min=1).float())
-
-    @property
-    def tasks(self) -> th.Tensor:
-        """``(batch, n_tasks, 2)``."""
-        return self.coordinates[:, 1:]
 
     def initial(self, n_samples: int, n_uavs: int) -> FleetState:
         """
@@ -106,7 +106,7 @@ class FleetGeometry(NamedTuple):
         """
         :param fleet: The fleet before
         :param task: Index of a task
-        :param mine: ``(batch, n_samples, n_uavs)`` bool, whose it becomes
+        :param mine: ``(batch, n_samples, n_uavs)`` bool, True for the UAV that gets it
         :return: The fleet with it
         """
         point = self.tasks[:, None, None, task]
@@ -120,7 +120,7 @@ class FleetGeometry(NamedTuple):
 
     def of_prefixes(self, mine: th.Tensor) -> FleetState:
         """
-        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, True where the task belongs to the UAV
         :return: The fleets before each task and after the last, ``(batch, n_samples, n_tasks + 1, n_uavs, ...)``
         """
         # What the node before each task adds; the depot adds nothing.
@@ -138,7 +138,8 @@ class FleetGeometry(NamedTuple):
 
     def of_assignment(self, mine: th.Tensor) -> FleetState:
         """
-        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is; of nobody if it has no UAV yet
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, True where the task belongs to the UAV,
+            which may be none
         :return: The fleet with these tasks
         """
         points = self.tasks[:, None, :, None]

@@ -1,7 +1,7 @@
 """
-Distances and their kin as inputs of the networks, which then need not learn them, in units of the maximum flight distance.
+Distances and related measures as inputs of the networks, in units of the maximum flight distance.
 
-In these units one network serves every maximum flight distance, and a task that can be reached lies within 0.5 of the depot.
+In these units one network works for every maximum flight distance, and reachable tasks lie within 0.5 of the depot.
 Factors and offsets bring each feature to a magnitude of about 1 where D = 2 on the unit square, the paper's distribution.
 """
 

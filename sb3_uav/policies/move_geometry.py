@@ -54,7 +54,7 @@ MoveFeature = IntEnum(
 
 class MoveGeometry(NamedTuple):
     """
-    What the router needs to measure a UAV's next moves.
+    Precomputed distances for the features of a UAV's next moves.
 
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param home: ``(batch, n_tasks + 1)``, distance to the depot
@@ -81,8 +81,8 @@ class MoveGeometry(NamedTuple):
 
     def features(self, position: th.Tensor, remaining: th.Tensor, action_mask: th.Tensor) -> th.Tensor:
         """
-        :param position: ``(batch, n_samples)`` int64, the node where the UAV is
-        :param remaining: ``(batch, n_samples)``, what it can still fly, in units of the maximum
+        :param position: ``(batch, n_samples)`` int64, the UAV's current node
+        :param remaining: ``(batch, n_samples)``, remaining flight distance, in units of the maximum
         :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
         :return: ``(batch, n_samples, n_tasks + 1, len(MoveFeature))``
         """
