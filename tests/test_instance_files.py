@@ -90,7 +90,9 @@ def test_pickles_are_refused_and_not_run(name: str, tmp_path: Path) -> None:
     """Neither in a field of ours nor in any other array of the file."""
     trap = np.array([Boobytrap(tmp_path / "sprung")], dtype=object)
     np.savez(tmp_path / "trap.npz", **arrays(**{name: trap}))
-    with pytest.raises(ValueError, match=r"trap\.npz: not an intact \.npz of plain arrays \(Object arrays cannot be loaded"):
+    with pytest.raises(
+        ValueError, match=rf"trap\.npz: not an intact \.npz of plain arrays \(array '{name}': Object arrays cannot be loaded"
+    ):
         Instances.load(tmp_path / "trap.npz")
     assert not (tmp_path / "sprung").exists()
 

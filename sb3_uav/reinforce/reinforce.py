@@ -316,7 +316,8 @@ class REINFORCE(OnPolicyAlgorithm):
                     for info, episode_return, length in zip(infos, returns[:, sample], lengths[:, sample], strict=True):
                         info["episode"] = {"r": float(episode_return), "l": int(length)}
                     if batched is not None:
-                        batched.log_episode(batched.episode_info(returns[0, sample], lengths[0, sample]))
+                        for episode_return, length in zip(returns[:, sample], lengths[:, sample], strict=True):
+                            batched.log_episode(batched.episode_info(episode_return, length))
                 self.num_timesteps += self.n_envs
                 callback.update_locals(locals())
                 if not callback.on_step():
