@@ -243,6 +243,21 @@ def test_observations_hold_the_state(level: str, seed: int) -> None:
     assert env.action_masks().any()
 
 
+@both_levels
+@settings(max_examples=40)
+@given(instances=instance_batches(max_batch=1), seed=seeds, recklessness=st.sampled_from([0.0, 0.3, 1.0]))
+def test_some_action_is_legal_in_every_state(level: str, instances: Instances, seed: int, recklessness: float) -> None:
+    """Of every instance that can be given, after legal and illegal actions, until the end and after it."""
+    rng = np.random.default_rng(seed)
+    env = make(level, n_tasks=9, **({"n_uavs": instances.n_uavs} if level == "allocation" else {}))
+    observation, _ = env.reset(options={"instance": instances})
+    for _ in range(11):
+        assert observation["action_mask"].any() and env.action_masks().any()
+        reckless = rng.random() < recklessness
+        observation, _, terminated, _, _ = env.step(env.action_space.sample() if reckless else act(env, rng))
+    assert terminated
+
+
 def check_open_length(instance: Instances, nodes: list[int]) -> float:
     """Length of the way from the depot through these nodes."""
     stops = np.vstack([instance.depot[0].numpy(), *(instance.tasks[0, node - 1].numpy() for node in nodes)])

@@ -75,6 +75,32 @@ def test_missing_file(tmp_path: Path) -> None:
         Instances.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("prize", "values"),
+        ("Prizes", "values"),
+        ("value", "values"),
+        ("reward", "values"),
+        ("vales", "values"),
+        ("D", "max_distance"),
+        ("max-dist", "max_distance"),
+        ("maxdistance", "max_distance"),
+        ("num_uavs", "n_uavs"),
+        ("mask", "task_mask"),
+        ("customers", "tasks"),
+        ("depots", "depot"),
+        ("comment", None),
+    ],
+)
+def test_unknown_arrays_are_refused_with_the_name_that_was_meant(name: str, meant: str | None, tmp_path: Path) -> None:
+    """Today's prizes under another name would otherwise be ignored without a word."""
+    np.savez(tmp_path / "plan.npz", **arrays(), **{name: np.ones((2, 3))})
+    advice = f"did you mean '{meant}'" if meant else "remove it; the known ones are depot, tasks, values"
+    with pytest.raises(ValueError, match=rf"plan\.npz: array '{name}' is not a part of instances; {advice}"):
+        Instances.load(tmp_path / "plan.npz")
+
+
 class Boobytrap:
     """Leaves a file behind when it is unpickled."""
 

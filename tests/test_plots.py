@@ -70,10 +70,10 @@ def test_legend_and_extent_of_a_map(instances: Instances) -> None:
     loop = np.vstack([points[:4], points[0]])
     length, single = np.linalg.norm(np.diff(loop, axis=0), axis=1).sum(), 2 * np.linalg.norm(points[4] - points[0])
     expected = [
-        f"UAV 1: 3 tasks, length {length:.2f} of 2.00",
-        f"UAV 2: 1 task, length {single:.2f} of 2.00",
-        "UAV 3: 0 tasks, length 0.00 of 2.00",
-        "depot",
+        f"UAV 1: 3 tasks, length {length:.2f}",
+        f"UAV 2: 1 task, length {single:.2f}",
+        "UAV 3: 0 tasks, length 0.00",
+        "depot (D = 2.00)",
         "8 tasks skipped",
     ]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == expected

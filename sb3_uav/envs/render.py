@@ -21,13 +21,14 @@ UAV_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9",
 
 # What the legend says of the tasks that no route holds.
 REMAINING_TASKS = {Stage.ASSIGNING: "not yet assigned", Stage.FLYING: "not yet visited", Stage.FINISHED: "skipped"}
-# Of larger fleets, only so many UAVs are drawn and named.
-MAX_UAVS_SHOWN = 24
+# The legend of a larger fleet would not fit below the map.
+MAX_UAVS_NAMED = 12
 LEGEND_COLUMNS = 2
 
 # Sides of the map, in units of the points' extent.
 BORDER = 1.08
-MARGINS = {"left": 0.1, "right": 0.9, "bottom": 0.1, "top": 0.9}
+# Inches: a figure, the frame around the map, and a line of the legend below it.
+FIGURE_WIDTH, FIGURE_HEIGHT, MARGIN, LEGEND_LINE_HEIGHT = 5.0, 5.6, 0.15, 0.185
 
 
 def require_matplotlib() -> Any:
@@ -67,11 +68,14 @@ def draw_map(
     depot = instances.depot[row].numpy()
     tasks = instances.tasks[row][instances.task_mask[row]].numpy()
     maximum = float(instances.max_distance[row])
-    shown = _shown_uavs(routes)
-    for uav in shown:
+    named = _named_uavs(routes)
+    for uav, route in enumerate(routes):
+        if len(route) == 0 and uav not in named:
+            continue
         color = UAV_COLOURS[uav % len(UAV_COLOURS)]
-        points = tasks[list(routes[uav])]
+        points = tasks[list(route)]
         label = f"UAV {uav + 1}: {_counted(len(points))}, {_distances(depot, points, maximum, stage)}"
+        label = label if uav in named else "_nolegend_"
         if stage is not Stage.ASSIGNING:
             path = np.vstack([depot, points, depot] if stage is Stage.FINISHED else [depot, points])
             axes.plot(*path.T, color=color, linewidth=1.4, zorder=3, label=label)
@@ -79,9 +83,9 @@ def draw_map(
         axes.scatter(*points.T, s=22, color=color, zorder=4, label=label)
         if stage is Stage.FLYING:
             axes.scatter(*path[-1], marker="^", s=70, facecolors="none", edgecolors=color, linewidths=1.6, zorder=6)
-    if len(shown) < len(routes):
-        axes.scatter([], [], s=0, label=f"{len(routes) - len(shown)} more UAVs")
-    axes.scatter(*depot, marker="s", s=70, color="black", zorder=5, label="depot")
+    if len(named) < len(routes):
+        axes.scatter([], [], s=0, label=f"{len(routes) - len(named)} more UAVs")
+    axes.scatter(*depot, marker="s", s=70, color="black", zorder=5, label=f"depot (D = {_rounded(maximum, maximum)})")
     visited = {task for route in routes for task in route}
     hollow = [task for task in range(len(tasks)) if task not in visited]
     circles = dict(s=22, facecolors="none", edgecolors="0.55", linewidths=0.9, zorder=2)
@@ -97,27 +101,31 @@ def legend_lines(routes: Sequence[Sequence[int]]) -> int:
     :param routes: Task indices per UAV
     :return: Number of lines of the legend that :func:`draw_map` puts below the map
     """
-    shown = len(_shown_uavs(routes))
+    named = len(_named_uavs(routes))
     # Depot and hollow tasks have entries too.
-    return math.ceil((shown + (shown < len(routes)) + 2) / LEGEND_COLUMNS)
+    return math.ceil((named + (named < len(routes)) + 2) / LEGEND_COLUMNS)
 
 
-def _shown_uavs(routes: Sequence[Sequence[int]]) -> list[int]:
-    """The UAVs to draw and to name in the legend: all of a small fleet, the first busy ones of a large one."""
-    if len(routes) <= MAX_UAVS_SHOWN:
-        return list(range(len(routes)))
-    return list(itertools.islice((uav for uav, route in enumerate(routes) if len(route) > 0), MAX_UAVS_SHOWN))
+def _named_uavs(routes: Sequence[Sequence[int]]) -> set[int]:
+    """The UAVs to name in the legend: all of a small fleet, the first busy ones of a large one."""
+    if len(routes) <= MAX_UAVS_NAMED:
+        return set(range(len(routes)))
+    return set(itertools.islice((uav for uav, route in enumerate(routes) if len(route) > 0), MAX_UAVS_NAMED))
 
 
 def _distances(depot: np.ndarray, points: np.ndarray, maximum: float, stage: Stage) -> str:
     """What the legend says of a UAV's distances."""
-    style = ".2f" if 0.1 <= maximum < 1e6 else ".3g"
     path = np.vstack([depot, points, depot] if stage is Stage.FINISHED else [depot, points])
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) if stage is not Stage.ASSIGNING else 0.0
     if stage is Stage.FINISHED:
-        return f"length {length:{style}} of {maximum:{style}}"
+        return f"length {_rounded(length, maximum)}"
     # Rounding may leave less than nothing.
-    return f"{max(maximum - length, 0.0):{style}} of {maximum:{style}} left"
+    return f"{_rounded(max(maximum - length, 0.0), maximum)} left"
+
+
+def _rounded(distance: float, maximum: float) -> str:
+    """Two digits after the point if the maximum flight distance is of ordinary magnitude, else three in all."""
+    return f"{distance:.2f}" if 0.1 <= maximum < 1e6 else f"{distance:.3g}"
 
 
 def _set_limits(axes: Any, points: np.ndarray) -> None:
@@ -153,9 +161,9 @@ class MapFigure:
                 logger.warning("No display was found, so render_mode='human' shows nothing; use render_mode='rgb_array'.")
                 self.interactive = False
         if self.interactive:
-            self.figure = plt.figure(figsize=(5, 5.6))
+            self.figure = plt.figure(figsize=(FIGURE_WIDTH, FIGURE_HEIGHT))
         else:
-            self.figure = matplotlib.figure.Figure(figsize=(5, 5.6), dpi=100)
+            self.figure = matplotlib.figure.Figure(figsize=(FIGURE_WIDTH, FIGURE_HEIGHT), dpi=100)
         self.axes = self.figure.add_subplot()
 
     def draw(self, episodes: Episodes, row: int) -> None:
@@ -165,11 +173,18 @@ class MapFigure:
         :param episodes: Episodes that have begun
         :param row: Which of them
         """
+        routes = episodes.routes(row)
         self.axes.clear()
-        draw_map(self.axes, episodes.instances, row, episodes.routes(row), stage=episodes.stage(row))
-        # tight_layout starts from the last layout: without a fresh start the same map would look different the second time.
-        self.figure.subplots_adjust(**MARGINS)
-        self.figure.tight_layout()
+        draw_map(self.axes, episodes.instances, row, routes, stage=episodes.stage(row))
+        # Not tight_layout, which starts from the last layout and cuts off long legends.
+        legend = 2 * MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
+        self.figure.subplots_adjust(
+            left=MARGIN / FIGURE_WIDTH,
+            right=1 - MARGIN / FIGURE_WIDTH,
+            bottom=legend / FIGURE_HEIGHT,
+            top=1 - MARGIN / FIGURE_HEIGHT,
+        )
+        self.axes.set_anchor("N")
 
     def rgb_array(self) -> np.ndarray:
         """``(height, width, 3)`` uint8."""
