@@ -95,7 +95,7 @@ def test_missing_file(tmp_path: Path) -> None:
 )
 def test_unknown_arrays_are_refused_with_the_name_that_was_meant(name: str, meant: str | None, tmp_path: Path) -> None:
     """Today's prizes under another name would otherwise be ignored without a word."""
-    np.savez(tmp_path / "plan.npz", **arrays(), **{name: np.ones((2, 3))})
+    np.savez(tmp_path / "plan.npz", **arrays(**{name: np.ones((2, 3))}))
     advice = f"did you mean '{meant}'" if meant else "remove it; the known ones are depot, tasks, values"
     with pytest.raises(ValueError, match=rf"plan\.npz: array '{name}' is not a part of instances; {advice}"):
         Instances.load(tmp_path / "plan.npz")
