@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator, check_schedule
 from sb3_uav.envs.instances import FAR_FROM_ORIGIN
-from sb3_uav.policies.encoder import StaticObservation
+from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.solvers import make_solver
 
 OFFSETS = [(1e6, 1e6), (1e7, 1e7), (-2e7, 5e6), (0.0, 1e9)]
