@@ -10,24 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from conftest import instance_batches, seeds
+from conftest import instance_batches, random_assignment, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instance_helpers import arrays, assert_equal
 
-from sb3_uav.envs import (
-    AllocationProblem,
-    Instances,
-    RoutePlanningEnv,
-    Schedule,
-    TaskAllocationEnv,
-    UniformGenerator,
-    check_schedule,
-    nearest_feasible,
-    plan_tours,
-    split_tasks,
-)
-from sb3_uav.envs.allocation import UNASSIGNED, useful_allocation
+from sb3_uav.envs import Instances, RoutePlanningEnv, Schedule, TaskAllocationEnv, UniformGenerator, check_schedule
+from sb3_uav.envs.allocation import AllocationProblem, plan_tours, split_tasks, useful_allocation
+from sb3_uav.envs.routing import nearest_feasible
 
 absurd = pytest.mark.parametrize("n_uavs", [10**6, 10**9])
 
@@ -92,9 +82,7 @@ def test_an_environment_and_its_picture_with_a_million_uavs() -> None:
 @settings(max_examples=60)
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 3), partial=st.booleans())
 def test_leaving_out_useless_uavs_changes_no_tour(instances: Instances, seed: int, n_samples: int, partial: bool) -> None:
-    rng = np.random.default_rng(seed)
-    low = UNASSIGNED if partial else 0
-    assignment = th.from_numpy(rng.integers(low, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
+    assignment = random_assignment(instances, n_samples, np.random.default_rng(seed), partial)
     fewer, numbered = useful_allocation(instances, assignment)
     assert fewer.n_uavs == instances.useful_fleet == min(instances.n_uavs, instances.n_tasks)
     assert th.equal(
