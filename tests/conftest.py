@@ -16,6 +16,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
+from sb3_uav.envs.allocation import UNASSIGNED
 from sb3_uav.envs.problem import Dynamics
 
 if TYPE_CHECKING:
@@ -138,6 +139,22 @@ def random_legal(mask: th.Tensor, generator: np.random.Generator) -> th.Tensor:
     """
     scores = th.from_numpy(generator.random(tuple(mask.shape)))
     return scores.masked_fill(~mask, -1.0).argmax(-1)
+
+
+def random_assignment(
+    instances: Instances, n_samples: int, generator: np.random.Generator, partial: bool = False
+) -> th.Tensor:
+    """
+    Any UAV for every task.
+
+    :param instances: ``batch`` instances
+    :param n_samples: Allocations per instance
+    :param generator: The source of randomness
+    :param partial: Whether some tasks are left without a UAV
+    :return: ``(batch, n_samples, n_tasks)`` int64
+    """
+    low = UNASSIGNED if partial else 0
+    return th.from_numpy(generator.integers(low, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
 
 
 def play_randomly(

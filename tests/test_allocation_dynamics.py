@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
-from conftest import instance_batches, play_randomly, random_legal, seeds
+from conftest import instance_batches, play_randomly, random_assignment, random_legal, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,9 +35,7 @@ def random_router(generator: np.random.Generator) -> Router:
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 3), partial=st.booleans())
 def test_split_gives_every_task_to_one_uav(instances: Instances, seed: int, n_samples: int, partial: bool) -> None:
     """Each UAV's tasks, in their order, at the front of its row, with the data of the original; then padding."""
-    rng = np.random.default_rng(seed)
-    low = UNASSIGNED if partial else 0
-    assignment = th.from_numpy(rng.integers(low, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
+    assignment = random_assignment(instances, n_samples, np.random.default_rng(seed), partial)
     subsets = split_tasks(instances, assignment)
     subsets.instances.validate()
     assert len(subsets.instances) == len(subsets.task_index) == len(instances) * n_samples * instances.n_uavs
@@ -63,7 +61,7 @@ def test_split_gives_every_task_to_one_uav(instances: Instances, seed: int, n_sa
 def test_planned_tours_pass_the_checker(instances: Instances, seed: int, n_samples: int, greedy: bool) -> None:
     """Their value is the checker's objective, and every UAV visits tasks of its own only."""
     rng = np.random.default_rng(seed)
-    assignment = th.from_numpy(rng.integers(0, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
+    assignment = random_assignment(instances, n_samples, rng)
     planned = plan_tours(instances, assignment, nearest_feasible if greedy else random_router(rng))
     assert planned.tours.shape[:3] == (len(instances), n_samples, instances.n_uavs)
     assert planned.value.shape == (len(instances), n_samples) and planned.value.dtype == th.float64

@@ -278,7 +278,8 @@ class REINFORCE(OnPolicyAlgorithm):
         # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
         for rewards, dones, infos in steps_of_episodes(returns, lengths, self.n_envs):  # noqa: B007
             if dones.all() and batched is not None:
-                batched.log_episode(batched.episode_info(infos[0]["episode"]["r"], infos[0]["episode"]["l"]))
+                for info in infos:
+                    batched.log_episode(batched.episode_info(info["episode"]["r"], info["episode"]["l"]))
             self.num_timesteps += self.n_envs
             callback.update_locals(locals())
             if not callback.on_step():
