@@ -305,9 +305,13 @@ class REINFORCE(OnPolicyAlgorithm):
             self.n_batches += 1
             self.n_instances += self.n_envs if batch is None else len(batch.instances)
             self.logger.record("train/epoch", self.epoch)
-            if self.n_instances >= (self.epoch + 1) * self.instances_per_epoch:
+            complete = self.n_instances // self.instances_per_epoch
+            if complete > self.epoch:
+                # A batch may complete several epochs. The policy is the same at the end of each, so the baseline is told once,
+                # as at the end of the last.
+                self.epoch = complete - 1
                 self._baseline.end_epoch(problem)
-                self.epoch += 1
+                self.epoch = complete
 
     def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
         """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
