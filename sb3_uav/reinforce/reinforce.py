@@ -34,6 +34,7 @@ from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
+from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, steps_of_episodes
 from sb3_uav.reinforce.recognition import find_problem
 
@@ -192,8 +193,8 @@ class REINFORCE(OnPolicyAlgorithm):
 
     def _refuse_baseline(self) -> None:
         raise ValueError(
-            f"baseline {self.baseline!r} replays instances, which needs a sb3_uav policy on a sb3_uav environment without "
-            "VecEnv wrappers that change rewards or observations; use 'none', 'exponential' or 'critic' here."
+            f"baseline {self.baseline!r} replays instances, which needs a sb3_uav policy on a sb3_uav environment, but "
+            f"{why_step_loop(self.policy_class, self.env)}; use 'none', 'exponential' or 'critic' here."
         )
 
     @property
@@ -373,6 +374,7 @@ class REINFORCE(OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfT:
+        warn_of_ignored_settings(self)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def learn_instances(
@@ -391,7 +393,8 @@ class REINFORCE(OnPolicyAlgorithm):
         :raises ValueError: If policy and environment leave only SB3's step loop
         """
         if self.problem is None:
-            raise ValueError("learn_instances needs a sb3_uav policy on a sb3_uav environment; use learn here.")
+            reason = why_step_loop(self.policy_class, self.env)
+            raise ValueError(f"learn_instances needs whole episodes, but {reason}; use learn here.")
         self.max_instances = self.n_instances + n_instances
         try:
             is_new = self.num_timesteps == 0
