@@ -33,6 +33,19 @@ def strip_wrappers(env: gym.Env) -> gym.Env:
     return inner
 
 
+def find_monitor(env: gym.Env) -> Monitor | None:
+    """
+    :param env: An environment
+    :return: The outermost ``Monitor`` around it
+    """
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, Monitor):
+            return inner
+        inner = inner.env
+    return None
+
+
 def _can_cut_off(limit: TimeLimit) -> bool:
     """Whether an episode inside may be longer than the limit; True if there is no telling."""
     n_steps = None if limit.spec is None else limit.spec.max_episode_steps
@@ -73,7 +86,7 @@ class BatchedVecEnv(VecEnv):
             raise ValueError(f"BatchedVecEnv cannot batch {env}; use stable_baselines3's DummyVecEnv for it.")
         self.template = problem_env
         self.problem: Problem = problem_env.problem
-        self._monitor = env if isinstance(env, Monitor) else None
+        self._monitor = find_monitor(env)
         self._info_keywords: tuple[str, ...] = () if self._monitor is None else self._monitor.info_keywords
         self._windows: dict[int, Any] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
@@ -143,6 +156,11 @@ class BatchedVecEnv(VecEnv):
         if self._monitor is None or self._monitor.results_writer is None:
             return None
         return os.path.dirname(self._monitor.results_writer.file_handler.name)
+
+    @property
+    def info_keywords(self) -> tuple[str, ...]:
+        """What the monitor file holds of an episode besides its return, length and time."""
+        return self._info_keywords
 
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -54,19 +53,20 @@ class Step(NamedTuple):
     infos: list[dict[str, Any]]
 
 
-def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_envs: int) -> Iterator[Step]:
+def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_steps: int) -> Iterator[Step]:
     """
-    Spread the episodes of a batch over as many steps as SB3's loop would have taken, ``n_envs`` environment steps each.
+    Spread episodes that have been played over steps of a ``VecEnv``.
 
-    :param returns: ``(batch, n_samples)``
-    :param lengths: ``(batch, n_samples)``, environment steps
-    :param n_envs: Number of environments
-    :return: The steps, sample by sample; all episodes of a sample end in its last one
+    :param returns: ``(batch,)``
+    :param lengths: ``(batch,)``, environment steps
+    :param n_steps: Number of steps, at least 1
+    :return: The steps; all episodes end in the last one
     """
-    for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
-        batch = len(sample_returns)
-        for _ in range(math.ceil(sample_lengths.sum() / n_envs) - 1):
-            yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
-        ended = zip(sample_returns.tolist(), sample_lengths.tolist(), strict=True)
-        infos = [{"episode": {"r": episode_return, "l": length}} for episode_return, length in ended]
-        yield Step(sample_returns.astype(np.float32), np.ones(batch, bool), infos)
+    batch = len(returns)
+    for _ in range(n_steps - 1):
+        yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
+    infos = [
+        {"objective": episode_return, "illegal_actions": 0, "episode": {"r": episode_return, "l": length}}
+        for episode_return, length in zip(returns.tolist(), lengths.tolist(), strict=True)
+    ]
+    yield Step(returns.astype(np.float32), np.ones(batch, bool), infos)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import pathlib
 from collections.abc import Iterable
 from copy import deepcopy
@@ -30,12 +31,12 @@ from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, steps_of_episodes
+from sb3_uav.reinforce.monitor_rows import log_episodes
 from sb3_uav.reinforce.recognition import find_problem
 
 SelfT = TypeVar("SelfT", bound="REINFORCE")
@@ -149,6 +150,8 @@ class REINFORCE(OnPolicyAlgorithm):
         self.n_instances = 0
         self.epoch = 0
         self._n_updates = 0
+        # How far num_timesteps, which grows by n_envs at a time, is ahead of the steps of the episodes played.
+        self.steps_ahead = 0
         # Collecting stops there; set by learn_instances and by the ITS callback.
         self.max_instances: int | None = None
         self._batch: EpisodeBatch | None = None
@@ -275,17 +278,19 @@ class REINFORCE(OnPolicyAlgorithm):
         :param lengths: ``(batch, n_samples)``
         :return: False if a callback wants to stop
         """
-        batched = env.unwrapped if isinstance(env.unwrapped, BatchedVecEnv) else None
-        # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
-        for rewards, dones, infos in steps_of_episodes(returns, lengths, self.n_envs):  # noqa: B007
-            if dones.all() and batched is not None:
-                batched.log_episode(batched.episode_info(infos[0]["episode"]["r"], infos[0]["episode"]["l"]))
-            self.num_timesteps += self.n_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            if dones.all():
-                self._update_info_buffer(infos, dones)
+        for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
+            n_played = int(sample_lengths.sum())
+            n_calls = max(math.ceil((n_played - self.steps_ahead) / self.n_envs), 1)
+            self.steps_ahead += n_calls * self.n_envs - n_played
+            # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
+            for rewards, dones, infos in steps_of_episodes(sample_returns, sample_lengths, n_calls):  # noqa: B007
+                self.num_timesteps += self.n_envs
+                if dones.all():
+                    log_episodes(env, infos)
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    return False
+            self._update_info_buffer(infos, dones)
         return True
 
     def train(self) -> None:
