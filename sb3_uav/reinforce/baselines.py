@@ -194,7 +194,7 @@ class RolloutBaseline(Baseline):
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
         instances = copy.arrange(instances)
         gains = []
-        for rows in th.arange(len(instances)).split(TEST_ROWS):
+        for rows in th.arange(len(instances), device=instances.device).split(TEST_ROWS):
             part = instances[rows].to(self.model.device)
             gains.append((greedy_returns(policy, problem, part) - greedy_returns(copy, problem, part)).cpu())
         gain = th.cat(gains).flatten().numpy()

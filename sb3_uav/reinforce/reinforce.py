@@ -301,6 +301,7 @@ class REINFORCE(OnPolicyAlgorithm):
         self.policy.optimizer.zero_grad()
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        self._refuse_non_finite({"loss": loss, "gradient norm": grad_norm})
         self.policy.optimizer.step()
         self._n_updates += 1
         self.logger.record("train/loss", loss.item())
@@ -319,6 +320,15 @@ class REINFORCE(OnPolicyAlgorithm):
                 self.epoch = complete - 1
                 self._baseline.end_epoch(problem)
                 self.epoch = complete
+
+    def _refuse_non_finite(self, values: dict[str, th.Tensor]) -> None:
+        for name, value in values.items():
+            if not math.isfinite(value.item()):
+                raise ValueError(
+                    f"The {name} is {value.item()} in update {self._n_updates + 1}, after {self.num_timesteps} steps; the "
+                    "parameters are still those of the update before. Continue from an earlier zip with a smaller "
+                    "learning_rate or max_grad_norm."
+                )
 
     def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
         """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
