@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -28,6 +29,7 @@ RECIPE: dict[str, Any] = dict(
 )
 
 
+@dataclass(frozen=True)
 class DividedSubsets:
     """
     Single-UAV subsets of instances that are divided without an allocator: half of them at random, as an untrained one does,
@@ -36,11 +38,12 @@ class DividedSubsets:
     :param generator: Draws the instances of the fleet
     """
 
-    n_uavs = 1
+    generator: InstanceGenerator
+    n_uavs: ClassVar[int] = 1
 
-    def __init__(self, generator: InstanceGenerator) -> None:
-        self.generator = generator
-        self.n_tasks = generator.n_tasks
+    @property
+    def n_tasks(self) -> int:
+        return self.generator.n_tasks
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
