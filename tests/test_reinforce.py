@@ -1,5 +1,6 @@
 """What REINFORCE learns, its gradient and its baselines."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -287,3 +288,31 @@ def test_critic_predicts_the_reward_to_go():
     model = make_model("router", "critic", make_env("router", 32), learning_rate=5e-3, n_samples=1)
     model.learn_instances(32 * 60)
     assert model.logger.name_to_value["train/explained_variance"] > 0.4
+
+
+# ------------------------------------------------------------------------------------------ numbers that are not finite
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize(("bad", "name"), [(math.nan, "loss"), (math.inf, "loss"), (math.nan, "gradient norm")])
+def test_a_loss_or_gradient_that_is_not_finite_stops_before_the_update(fused, bad, name, monkeypatch):
+    """The parameters stay as they were, hence finite."""
+    model: Any = make_model() if fused else REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, seed=0, device="cpu")
+    learn = (lambda: model.learn_instances(4)) if fused else lambda: model.learn(32, reset_num_timesteps=False)
+    learn()
+    before = flat_parameters(model)
+    if name == "loss":
+        monkeypatch.setattr(model, "_total_loss", lambda *args: bad * sum(p.sum() for p in model.policy.parameters()))
+    else:
+        next(model.policy.parameters()).register_hook(lambda gradient: gradient * bad)
+    with pytest.raises(ValueError, match=rf"The {name} is (nan|-?inf) in update 2, after \d+ steps; .*smaller learning_rate"):
+        learn()
+    assert th.equal(flat_parameters(model), before) and th.isfinite(before).all()
+    assert model._n_updates == 1
+
+
+def test_a_learning_rate_that_is_far_too_large_stops_with_an_error():
+    model = make_model("router", learning_rate=1e30)
+    with pytest.raises(ValueError, match="is nan in update"):
+        model.learn_instances(400)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())

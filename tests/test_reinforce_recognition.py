@@ -25,7 +25,7 @@ def fixed(seed: int = 0, n_instances: int = 8) -> Instances:
 
 
 def reward_doubled(env: gym.Env) -> gym.Env:
-    return TransformReward(env, lambda reward: 2 * reward)
+    return TransformReward(env, lambda reward: 2 * float(reward))
 
 
 class DoubledReward(RoutePlanningEnv):
