@@ -39,11 +39,12 @@ def test_drawn_seeds_fit_every_generator():
 
 
 def test_streams_differ_by_every_part_of_their_name():
-    """Trailing zeros count too."""
-    keys = [(0,), (0, 0), (0, 0, 0), (0, 1), (1,), (1, 0)]
+    """Trailing zeros count too, and no stream is that of a generator with the plain seed."""
+    keys = [(0, 0), (0, 0, 0), (0, 1), (0, 1, 0), (1, 0)]
     draws = [random_stream(*key).integers(2**63 - 1) for key in keys]
-    assert len({*draws, np.random.default_rng(0).integers(2**63 - 1)}) == len(keys) + 1
-    assert random_stream(0, 1).integers(2**63 - 1) == draws[3]
+    plain = [np.random.default_rng(seed).integers(2**63 - 1) for seed in (0, 1)]
+    assert len({*draws, *plain}) == len(keys) + 2
+    assert random_stream(0, 1).integers(2**63 - 1) == draws[2]
 
 
 def test_torch_generators_follow_their_source():
