@@ -8,7 +8,15 @@ import torch as th
 from reinforce_models import make_model
 from stable_baselines3 import A2C, PPO
 
-from sb3_uav.common.random_streams import draw_seed, random_stream, stream_seed, torch_generator
+from sb3_uav.common.random_streams import (
+    TEST_SEED,
+    draw_seed,
+    keyed_generator,
+    mixed_state,
+    random_stream,
+    stream_seed,
+    torch_generator,
+)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C])
@@ -50,3 +58,11 @@ def test_streams_differ_by_every_part_of_their_name():
 def test_torch_generators_follow_their_source():
     one, two, other = (th.rand(3, generator=torch_generator(random_stream(0, key), "cpu")) for key in (0, 0, 1))
     assert th.equal(one, two) and not th.equal(one, other)
+
+
+def test_numbers_of_solvers_and_test_sets_stay_what_published_results_were_made_with():
+    assert (
+        keyed_generator(5, 2).integers(1000, size=4).tolist() == np.random.default_rng([5, 2]).integers(1000, size=4).tolist()
+    )
+    assert keyed_generator(TEST_SEED).integers(1000, size=4).tolist() == [756, 848, 188, 851]
+    assert mixed_state(0) == 15793235383387715774

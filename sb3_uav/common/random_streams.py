@@ -22,6 +22,8 @@ GRID_SEED = 30_000_001
 ABLATION_SEED = 40_000_001
 # What all runs of a comparison share: its validation set and the router that it trains.
 SHARED_SEED = 0
+# The instance on which the compiled kernels of local search are loaded.
+WARM_UP_SEED = 0
 
 
 def random_stream(seed: int, *key: int) -> np.random.Generator:
@@ -32,6 +34,27 @@ def random_stream(seed: int, *key: int) -> np.random.Generator:
     """
     # Not default_rng([seed, *key]): trailing zeros would not count there, so that [0, 0] and 0 give the same numbers.
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
+
+def keyed_generator(*key: int) -> np.random.Generator:
+    """
+    The random numbers of solvers and test sets, on which published results depend.
+
+    Trailing zeros of the key do not count, so keys for the same purpose must have the same length; use :func:`random_stream`
+    for anything new.
+
+    :param key: Seed and counters
+    :return: A generator that depends on nothing else
+    """
+    return np.random.default_rng(list(key))
+
+
+def mixed_state(*key: int) -> np.uint64:
+    """
+    :param key: Seed and counters, as for :func:`keyed_generator`
+    :return: 64 well-mixed bits, the initial state of a generator that is not numpy's
+    """
+    return np.random.SeedSequence(list(key)).generate_state(1, np.uint64)[0]
 
 
 def torch_generator(rng: np.random.Generator, device: th.device | str) -> th.Generator:

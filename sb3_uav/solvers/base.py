@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 
@@ -133,7 +134,7 @@ class OneByOneSolver(Solver):
         start = time.perf_counter()
         # A row that is all padding keeps one slot, because no instance has none.
         trimmed = instance.trim(max(int(instance.task_mask.sum()), 1))
-        solution = self.solve_one(trimmed, time_limit, np.random.default_rng([seed, row]))
+        solution = self.solve_one(trimmed, time_limit, keyed_generator(seed, row))
         return SolverResult(solution.schedule, time.perf_counter() - start, bound=solution.bound)
 
     def solve_rows(
