@@ -1,4 +1,4 @@
-"""Which of REINFORCE's two drivers a policy and an environment allow, and which settings that leaves without effect."""
+"""REINFORCE's two drivers: why the fused one cannot be used, and which settings have no effect."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.reinforce.recognition import why_unrecognized
 
-# The settings of REINFORCE that only one of the drivers uses, and their defaults.
+# Settings of REINFORCE that only one of the drivers uses, with their defaults.
 FUSED_SETTINGS: dict[str, Any] = {"n_samples": 1, "instances_per_epoch": 1_280_000, "lr_decay": 1.0}
 STEP_LOOP_SETTINGS: dict[str, Any] = {"n_steps": 512, "gamma": 1.0}
 
@@ -18,8 +18,8 @@ STEP_LOOP_SETTINGS: dict[str, Any] = {"n_steps": 512, "gamma": 1.0}
 def why_step_loop(policy_class: type, env: VecEnv | None) -> str:
     """
     :param policy_class: The class of the algorithm's policy
-    :param env: Its environment
-    :return: Why the fused driver cannot play it, a clause without a period
+    :param env: The environment of the algorithm
+    :return: The reason why the fused driver cannot be used, a clause without a period
     """
     if not issubclass(policy_class, EpisodicPolicy):
         return f"{policy_class.__name__} is not a policy of sb3_uav"

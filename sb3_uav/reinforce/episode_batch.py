@@ -1,4 +1,4 @@
-"""Episodes that the fused driver has played, and how they look to code that expects SB3's step loop."""
+"""Episodes played by the fused driver, and their conversion to the steps that SB3's callbacks expect."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sb3_uav.policies.extractor import Cache
 
 class EpisodeBatch(NamedTuple):
     """
-    Complete episodes waiting for the gradient pass.
+    Complete episodes on which the next update is computed.
 
     :param instances: ``batch`` instances
-    :param cache: Their encodings, with gradients
+    :param cache: The encodings of the instances, with gradients
     :param actions: ``(batch, n_samples, n_steps)`` int64
     :param returns: ``(batch, n_samples)`` float64
-    :param baseline: Broadcastable against ``returns``
+    :param baseline: Baseline values, float64, broadcastable against ``returns``
     """
 
     instances: Instances
@@ -33,7 +33,7 @@ class EpisodeBatch(NamedTuple):
     def rewards_to_go(self, problem: Problem) -> th.Tensor:
         """
         :param problem: The problem that was played
-        :return: ``(batch, n_samples, n_steps)`` float32, the sum of the rewards of each step and of those after it
+        :return: ``(batch, n_samples, n_steps)`` float32, the sum of the rewards from each step to the end of the episode
         """
         collected = problem.step_rewards(self.instances, self.actions, self.returns)
         return collected.flip(-1).cumsum(-1).flip(-1).float()
@@ -44,7 +44,7 @@ class Step(NamedTuple):
     One step of ``batch`` environments in the form of a ``VecEnv``.
 
     :param rewards: ``(batch,)`` float32
-    :param dones: ``(batch,)`` bool, all alike
+    :param dones: ``(batch,)`` bool, all equal
     :param infos: Statistics of the episodes that end here, one dictionary per environment
     """
 
@@ -55,11 +55,11 @@ class Step(NamedTuple):
 
 def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_steps: int) -> Iterator[Step]:
     """
-    Spread episodes that have been played over steps of a ``VecEnv``.
+    Distribute played episodes over the steps of a ``VecEnv``.
 
-    :param returns: ``(batch,)``
-    :param lengths: ``(batch,)``, environment steps
-    :param n_steps: Number of steps, at least 1
+    :param returns: ``(batch,)``, episode returns
+    :param lengths: ``(batch,)``, episode lengths in environment steps
+    :param n_steps: Number of ``VecEnv`` steps, at least 1
     :return: The steps; all episodes end in the last one
     """
     batch = len(returns)

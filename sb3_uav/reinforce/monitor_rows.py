@@ -1,4 +1,4 @@
-"""Rows in SB3's monitor files for episodes that are played without stepping the environment."""
+"""Writes rows to SB3's monitor files for episodes that are played without stepping the environment."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, find_monitor
 
 def log_episodes(env: VecEnv, infos: Sequence[dict[str, Any]]) -> None:
     """
-    Write episodes where the monitors of an environment would have written them.
+    Write a row per episode to the monitor files of an environment.
 
     :param env: The environment
-    :param infos: What a ``VecEnv`` would say at the end of each episode; episode ``i`` belongs to row ``i``, modulo the number
-        of rows
+    :param infos: The final ``info`` of each episode, with its statistics under ``"episode"``; episode ``i`` belongs to row
+        ``i`` of the environment, modulo the number of rows
     """
     inner = env
     while isinstance(inner, VecEnvWrapper):
@@ -38,7 +38,7 @@ def log_episodes(env: VecEnv, infos: Sequence[dict[str, Any]]) -> None:
 
 
 def _log_in_row(env: Any, info: dict[str, Any]) -> None:
-    """Do what the ``Monitor`` around a single environment, if there is one, does when an episode ends."""
+    """Record an episode in the ``Monitor`` around a single environment, if there is one."""
     monitor = find_monitor(env)
     if monitor is None:
         return

@@ -1,4 +1,4 @@
-"""Finding the problem behind an algorithm's environment, so that whole episodes can be played without stepping it."""
+"""Finds the problem behind an algorithm's environment, so that whole episodes can be played without stepping it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TRANSPARENT_VEC_WRAPPERS = (VecMonitor, VecCheckNan)
 def find_problem(env: VecEnv) -> Problem | None:
     """
     :param env: The environment of an algorithm
-    :return: The problem behind it; None if it is not one of ours, or wrapped in something that changes what it does
+    :return: The problem behind it; None if it is not an environment of this package, or if a wrapper may change its behavior
     """
     found = _recognize(env)
     return found if isinstance(found, Problem) else None
@@ -23,15 +23,15 @@ def find_problem(env: VecEnv) -> Problem | None:
 
 def why_unrecognized(env: VecEnv) -> str:
     """
-    :param env: An environment in which :func:`find_problem` finds nothing
-    :return: The reason, a clause without a period
+    :param env: An environment for which :func:`find_problem` returns None
+    :return: The reason, a clause without a period; empty if there is a problem
     """
     found = _recognize(env)
     return found if isinstance(found, str) else ""
 
 
 def _recognize(env: VecEnv) -> Problem | str:
-    """:return: The problem, or why there is none"""
+    """:return: The problem, or the reason why there is none"""
     inner = env
     while isinstance(inner, TRANSPARENT_VEC_WRAPPERS):
         inner = inner.venv
@@ -46,7 +46,7 @@ def _recognize(env: VecEnv) -> Problem | str:
         if problem_env is None:
             return _obstacle(row)
         problems.append(problem_env.problem)
-    # One problem stands for all rows only if all rows have the same instances and rewards.
+    # One problem can represent all rows only if all rows have the same instances and rewards.
     first = problems[0]
     for number, other in enumerate(problems):
         rows = f"rows 0 and {number} of the {type(inner).__name__}"
@@ -63,7 +63,7 @@ def _recognize(env: VecEnv) -> Problem | str:
 
 
 def _obstacle(row: object) -> str:
-    """Why an environment is not recognized as one of ours."""
+    """The reason why an environment is not recognized as one of this package."""
     inner = strip_wrappers(row)  # type: ignore[arg-type]
     name = type(inner).__name__
     if isinstance(inner.unwrapped, ProblemEnv) and inner is not inner.unwrapped:
