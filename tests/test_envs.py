@@ -72,10 +72,10 @@ def test_given_instance_is_played(level: str, instances: Instances, seed: int) -
     rng = np.random.default_rng(seed)
     env = make(level, n_tasks=9, **({"n_uavs": instances.n_uavs} if level == "allocation" else {}))
     observations, rewards = play(env, rng, options={"instance": instances})
-    n_tasks = instances.n_tasks
+    n_tasks, shown = instances.n_tasks, instances.near_origin()
     for observation in observations:
-        assert observation["depot"] == pytest.approx(instances.depot[0].float().numpy())
-        assert np.array_equal(observation["tasks"][: 2 * n_tasks], instances.tasks[0].float().flatten().numpy())
+        assert np.array_equal(observation["depot"], shown.depot[0].float().numpy())
+        assert np.array_equal(observation["tasks"][: 2 * n_tasks], shown.tasks[0].float().flatten().numpy())
         assert np.array_equal(observation["task_values"][:n_tasks], instances.values[0].float().numpy())
         assert observation["task_mask"].tolist() == instances.task_mask[0].tolist() + [0] * (9 - n_tasks)
         assert observation["max_distance"] == instances.max_distance.float().numpy()
@@ -241,6 +241,21 @@ def test_observations_hold_the_state(level: str, seed: int) -> None:
         actions.append(act(env, rng))
         observation, _, terminated, _, _ = env.step(actions[-1])
     assert env.action_masks().any()
+
+
+@both_levels
+@settings(max_examples=40)
+@given(instances=instance_batches(max_batch=1), seed=seeds, recklessness=st.sampled_from([0.0, 0.3, 1.0]))
+def test_some_action_is_legal_in_every_state(level: str, instances: Instances, seed: int, recklessness: float) -> None:
+    """Of every instance that can be given, after legal and illegal actions, until the end and after it."""
+    rng = np.random.default_rng(seed)
+    env = make(level, n_tasks=9, **({"n_uavs": instances.n_uavs} if level == "allocation" else {}))
+    observation, _ = env.reset(options={"instance": instances})
+    for _ in range(11):
+        assert observation["action_mask"].any() and env.action_masks().any()
+        reckless = rng.random() < recklessness
+        observation, _, terminated, _, _ = env.step(env.action_space.sample() if reckless else act(env, rng))
+    assert terminated
 
 
 def check_open_length(instance: Instances, nodes: list[int]) -> float:

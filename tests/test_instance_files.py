@@ -75,6 +75,32 @@ def test_missing_file(tmp_path: Path) -> None:
         Instances.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("prize", "values"),
+        ("Prizes", "values"),
+        ("value", "values"),
+        ("reward", "values"),
+        ("vales", "values"),
+        ("D", "max_distance"),
+        ("max-dist", "max_distance"),
+        ("maxdistance", "max_distance"),
+        ("num_uavs", "n_uavs"),
+        ("mask", "task_mask"),
+        ("customers", "tasks"),
+        ("depots", "depot"),
+        ("comment", None),
+    ],
+)
+def test_unknown_arrays_are_refused_with_the_name_that_was_meant(name: str, meant: str | None, tmp_path: Path) -> None:
+    """Today's prizes under another name would otherwise be ignored without a word."""
+    np.savez(tmp_path / "plan.npz", **arrays(**{name: np.ones((2, 3))}))
+    advice = f"did you mean '{meant}'" if meant else "remove it; the known ones are depot, tasks, values"
+    with pytest.raises(ValueError, match=rf"plan\.npz: array '{name}' is not a part of instances; {advice}"):
+        Instances.load(tmp_path / "plan.npz")
+
+
 class Boobytrap:
     """Leaves a file behind when it is unpickled."""
 
@@ -90,7 +116,9 @@ def test_pickles_are_refused_and_not_run(name: str, tmp_path: Path) -> None:
     """Neither in a field of ours nor in any other array of the file."""
     trap = np.array([Boobytrap(tmp_path / "sprung")], dtype=object)
     np.savez(tmp_path / "trap.npz", **arrays(**{name: trap}))
-    with pytest.raises(ValueError, match=r"trap\.npz: not an intact \.npz of plain arrays \(Object arrays cannot be loaded"):
+    with pytest.raises(
+        ValueError, match=rf"trap\.npz: not an intact \.npz of plain arrays \(array '{name}': Object arrays cannot be loaded"
+    ):
         Instances.load(tmp_path / "trap.npz")
     assert not (tmp_path / "sprung").exists()
 

@@ -75,7 +75,7 @@ def test_legend_and_extent_of_a_map(instances: Instances) -> None:
         f"UAV 1: 3 tasks, length {length:.2f}",
         f"UAV 2: 1 task, length {single:.2f}",
         "UAV 3: 0 tasks, length 0.00",
-        "depot",
+        "depot (D = 2.00)",
         "8 tasks skipped",
     ]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == expected

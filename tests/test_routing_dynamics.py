@@ -94,6 +94,46 @@ def test_a_tour_of_exactly_the_maximum_is_feasible(case: tuple[Instances, list[i
     assert check_schedule(instances, 0, Schedule([route])).length == pytest.approx(length, rel=1e-12, abs=0)
 
 
+@st.composite
+def lattice_tours(draw: st.DrawFn) -> tuple[np.ndarray, list[int]]:
+    """A depot and tasks on a lattice of any spacing and place, ``(n_tasks + 1, 2)``, and a tour of some of them."""
+    n_tasks = draw(st.integers(1, 8))
+    cells = st.tuples(st.integers(0, 6), st.integers(0, 6))
+    points = np.array(draw(st.lists(cells, min_size=n_tasks + 1, max_size=n_tasks + 1)), dtype=float)
+    spacing = draw(st.sampled_from([1.0, 0.1, 1 / 3, 7.0, 100.0, 1e-6]))
+    offset = spacing * draw(st.sampled_from([0, 1, -3, 1000]))
+    route = draw(st.permutations(range(n_tasks)))[: draw(st.integers(1, n_tasks))]
+    return offset + spacing * points, route
+
+
+@settings(max_examples=300)
+@given(case=lattice_tours())
+def test_lattice_tours_of_exactly_the_maximum_are_flyable(case: tuple[np.ndarray, list[int]]) -> None:
+    """With D computed as a user would, from exact cells or from rounded coordinates; a thousandth less is too short."""
+    points, route = case
+    stops = points[[0, *(task + 1 for task in route), 0]]
+    length = float(np.hypot(*np.diff(stops, axis=0).T).sum())
+    if length == 0:
+        return
+    for limit in (length, np.nextafter(length, 0), np.nextafter(length, np.inf)):
+        instances = Instances.from_arrays(points[0], points[1:], max_distance=limit, n_uavs=1)
+        assert all(follow(instances, route))
+        assert check_schedule(instances, 0, Schedule([route])).objective == len(route)
+    short = Instances.from_arrays(points[0], points[1:], max_distance=0.999 * length, n_uavs=1)
+    assert not all(follow(short, route))
+    with pytest.raises(InfeasibleScheduleError, match="over its maximum"):
+        check_schedule(short, 0, Schedule([route]))
+
+
+def test_the_perimeter_of_a_lattice_square_is_flyable() -> None:
+    """Four sides of 0.1 three times: ten steps of 0.1 add up to less than 1 in floats, and to D = 1.2 within the tolerance."""
+    ring = [(0.1 * i, 0.0) for i in range(1, 4)] + [(0.3, 0.1 * i) for i in range(1, 4)]
+    ring += [(0.1 * i, 0.3) for i in (2, 1, 0)] + [(0.0, 0.1 * i) for i in (2, 1)]
+    instances = Instances.from_arrays([0, 0], ring, max_distance=1.2, n_uavs=1)
+    assert all(follow(instances, list(range(11))))
+    assert check_schedule(instances, 0, Schedule([range(11)])).objective == 11
+
+
 @settings(max_examples=100)
 @given(instances=instance_batches(), seed=seeds)
 def test_every_accepted_tour_passes_the_checker(instances: Instances, seed: int) -> None:

@@ -102,7 +102,7 @@ def test_options_and_seeds_are_used_once(level: str, instances: Instances, seed:
     assert_same_arrays(first, reset(theirs))
     n_tasks = instances.n_tasks
     assert first["task_mask"].sum(1).tolist() == [n_tasks if row != 1 else 10 for row in range(n_envs)]
-    assert np.array_equal(first["tasks"][0, : 2 * n_tasks], instances.tasks[0].float().flatten().numpy())
+    assert np.array_equal(first["tasks"][0, : 2 * n_tasks], instances.near_origin().tasks[0].float().flatten().numpy())
     assert_same_run(ours, theirs, np.random.default_rng(seed), n_tasks + 2, 0.0)
     again = reset(ours)
     assert_same_arrays(again, reset(theirs))

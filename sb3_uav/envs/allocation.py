@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import sweep_order
@@ -58,7 +58,8 @@ class AllocationDynamics(Dynamics):
             assignment=th.full((batch_size, n_samples, n_tasks), UNASSIGNED, dtype=th.int64, device=device),
             task=task,
             done=task >= self._n_real,
-            action_mask=th.ones(batch_size, n_samples, self.instances.n_uavs, dtype=th.bool, device=device),
+            # Expanded, because a fleet may be absurdly large.
+            action_mask=th.ones(1, dtype=th.bool, device=device).expand(batch_size, n_samples, self.instances.n_uavs),
         )
 
     def step(self, state: AllocationState, actions: th.Tensor) -> tuple[AllocationState, th.Tensor]:
@@ -72,7 +73,7 @@ class AllocationDynamics(Dynamics):
         rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
         rows = finished.any(1)
         if rows.any():
-            value = plan_tours(self.instances[rows], assignment[rows], self.router).value
+            value = planned_value(self.instances[rows], assignment[rows], self.router)
             rewards[rows] = value.where(finished[rows], 0.0)
         return AllocationState(assignment, task, done, state.action_mask), rewards
 
@@ -102,11 +103,11 @@ def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     order = key.argsort(dim=-1, stable=True)
     counts = th.zeros(batch_size, n_samples, n_uavs + 1, dtype=th.int64, device=key.device)
     counts = counts.scatter_add(-1, key, th.ones_like(key))[..., :n_uavs]
-    n_slots = max(int(counts.max()), 1)
+    n_slots = max(int(counts.max()), 1) if len(instances) > 0 else 1
     slots = th.arange(n_slots, device=key.device)
     start = counts.cumsum(-1) - counts
     position = (start[..., None] + slots).clamp(max=n_tasks - 1)
-    task_index = order.gather(-1, position.flatten(2)).view(batch_size, -1)
+    task_index = order.gather(-1, position.flatten(2)).flatten(1)
     task_mask = (slots < counts[..., None]).view(-1, n_slots)
 
     def per_uav(field: th.Tensor) -> th.Tensor:
@@ -148,7 +149,36 @@ def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> P
     nodes = router(subsets.instances).to(assignment.device)
     value = collected_value(subsets.instances, nodes).view(shape).sum(-1)
     tours = subsets.task_index.gather(1, (nodes - 1).clamp(min=0)).masked_fill(nodes == DEPOT, -1)
-    return PlannedTours(tours.view(*shape, -1), value)
+    return PlannedTours(tours.view(*shape, nodes.shape[1]), value)
+
+
+def useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
+    """
+    Leave out the UAVs that no allocation can use, so that an absurdly large fleet costs no memory.
+
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64
+    :return: Both as they are if there are no more UAVs than tasks. Otherwise the instances with one UAV per task, and the
+        assignment with the UAVs that have tasks numbered from 0, in the same order
+    """
+    if instances.n_uavs <= instances.n_tasks:
+        return instances, assignment
+    left_out = (assignment == UNASSIGNED) | ~instances.task_mask[:, None]
+    sorted_uavs, order = assignment.masked_fill(left_out, instances.n_uavs).sort(dim=-1)
+    number = th.zeros_like(assignment)
+    number[..., 1:] = (sorted_uavs[..., 1:] != sorted_uavs[..., :-1]).cumsum(-1)
+    numbered = number.scatter(-1, order, number).masked_fill(left_out, UNASSIGNED)
+    return replace(instances, n_uavs=instances.useful_fleet), numbered
+
+
+def planned_value(instances: Instances, assignment: th.Tensor, router: Router) -> th.Tensor:
+    """
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64
+    :param router: Plans one tour per row
+    :return: ``(batch, n_samples)`` float64, what the planned tours collect, whatever the size of the fleet
+    """
+    return plan_tours(*useful_allocation(instances, assignment), router).value
 
 
 def schedules(tours: th.Tensor) -> list[Schedule]:
@@ -168,6 +198,8 @@ class AllocationProblem(Problem):
     :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot
     :raises ValueError: If there is no such order
     """
+
+    running_stage = Stage.ASSIGNING
 
     def __init__(self, generator: InstanceGenerator, router: Router | None = None, task_order: str = "input") -> None:
         super().__init__(generator)
@@ -211,7 +243,7 @@ class AllocationProblem(Problem):
         }
 
     def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        return plan_tours(instances, actions, self.router).value
+        return planned_value(instances, actions, self.router)
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
         rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
@@ -223,12 +255,14 @@ class AllocationProblem(Problem):
         return instances.task_mask.sum(1).clamp(min=1)[:, None].expand(actions.shape[:2])
 
     def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
-        # Until the end there are no tours: draw the tasks of each UAV in the order in which it got them.
+        assignment = np.full((1, 1, instance.n_tasks), UNASSIGNED)
+        assignment[0, 0, : len(actions)] = actions
+        instance, allocation = useful_allocation(instance, th.from_numpy(assignment))
+        # Until the end there are no tours: these are the tasks of each UAV, in the order in which it got them.
         if len(actions) < int(instance.task_mask.sum()):
-            return [[task for task, uav in enumerate(actions) if uav == v] for v in range(instance.n_uavs)]
-        assignment = th.full((1, 1, instance.n_tasks), UNASSIGNED)
-        assignment[0, 0, : len(actions)] = th.tensor(actions)
-        planned = plan_tours(instance, assignment, self.router)
+            uavs = allocation[0, 0].tolist()
+            return [[task for task, uav in enumerate(uavs) if uav == v] for v in range(instance.n_uavs)]
+        planned = plan_tours(instance, allocation, self.router)
         return [list(route) for route in schedules(planned.tours[:, 0])[0].routes]
 
 

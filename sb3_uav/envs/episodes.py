@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 
 
 class StepResult(NamedTuple):
@@ -101,7 +101,9 @@ class Episodes:
             raise ResetNeeded("There is no episode to step yet; call reset() first.")
         given = np.asarray(actions)
         n_actions = self.state.action_mask.shape[-1]
-        if given.size != self.n_envs or not np.isin(given, np.arange(n_actions)).all():
+        # Not np.isin with all the actions, of which there may be a million.
+        is_number = given.dtype.kind in "biuf" and given.size == self.n_envs
+        if not is_number or not ((given >= 0) & (given < n_actions) & (given == np.floor(given))).all():
             raise ValueError(
                 f"Give {self.n_envs} whole numbers between 0 and {n_actions - 1} as actions; found {given.tolist()!r:.80}."
             )
@@ -130,6 +132,10 @@ class Episodes:
     def routes(self, row: int) -> list[list[int]]:
         """The routes of one row's episode so far, task indices from 0 per UAV."""
         return self.problem.routes(self.instances[row], self._actions[row])
+
+    def stage(self, row: int) -> Stage:
+        """How far one row's episode is."""
+        return Stage.FINISHED if bool(self.state.done[row].all()) else self.problem.running_stage
 
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import torch as th
 
-from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.instances import MAX_UAVS, Instances
 
 
 class InstanceGenerator(Protocol):
@@ -37,8 +37,8 @@ def check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
     """
     if n_tasks < 1:
         raise ValueError(f"n_tasks is {n_tasks}, but an instance needs at least 1 task.")
-    if n_uavs < 1:
-        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV.")
+    if not 1 <= n_uavs <= MAX_UAVS:
+        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV, and {MAX_UAVS} at most.")
     if not (np.isfinite(max_distance) and max_distance > 0):
         raise ValueError(f"max_distance is {max_distance}, but the maximum flight distance must be a finite number > 0.")
 
@@ -48,10 +48,10 @@ def _with_unit_values(depot: np.ndarray, tasks: np.ndarray, max_distance: float,
     return Instances(
         depot=th.from_numpy(depot),
         tasks=th.from_numpy(tasks),
-        values=th.ones(batch_size, n_tasks, dtype=th.float64),
-        max_distance=th.full((batch_size,), max_distance, dtype=th.float64),
+        values=th.ones(batch_size, n_tasks, dtype=th.float64, device="cpu"),
+        max_distance=th.full((batch_size,), max_distance, dtype=th.float64, device="cpu"),
         n_uavs=n_uavs,
-        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool),
+        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool, device="cpu"),
     )
 
 
@@ -181,9 +181,14 @@ class FixedGenerator:
     Two of them are equal if their instances are, so that environments that read the same file play the same problem.
 
     :param instances: The instances to draw from
+    :raises ValueError: If there are none
     """
 
     instances: Instances
+
+    def __post_init__(self) -> None:
+        if len(self.instances) == 0:
+            raise ValueError("There are no instances to draw from; give at least one.")
 
     # Taken once: it is compared at every update, and the instances are not meant to change.
     @cached_property

@@ -96,7 +96,7 @@ class ProblemEnv(gym.Env[Any, Any]):
 
         if self._figure is None:
             self._figure = MapFigure(interactive=self.render_mode == "human")
-        self._figure.draw(self.episodes.instances, 0, self.episodes.routes(0))
+        self._figure.draw(self.episodes, 0)
         return self._figure.rgb_array() if self.render_mode == "rgb_array" else self._figure.show()
 
     def close(self) -> None:

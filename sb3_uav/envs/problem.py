@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from enum import Enum
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -16,6 +17,14 @@ StateT = TypeVar("StateT", bound="State")
 
 # What an observation keeps throughout an episode.
 STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
+
+
+class Stage(Enum):
+    """How far an episode is, for drawings."""
+
+    ASSIGNING = "tasks are being assigned to UAVs, and nobody has taken off"
+    FLYING = "a UAV is on its way"
+    FINISHED = "all UAVs are back in the depot"
 
 
 class State(Protocol):
@@ -71,6 +80,8 @@ class Problem(ABC):
 
     observation_space: spaces.Dict
     action_space: spaces.Discrete
+    # How far an episode is before it ends.
+    running_stage: ClassVar[Stage]
     # Whether the number of UAVs of an instance matters.
     uses_fleet: ClassVar[bool] = True
 
@@ -179,7 +190,13 @@ class Problem(ABC):
 
     @staticmethod
     def observe_static(instances: Instances) -> dict[str, th.Tensor]:
-        """The part of the observation that an episode keeps, float32 with leading dimension ``batch``."""
+        """
+        The part of the observation that an episode keeps.
+
+        :param instances: ``batch`` instances
+        :return: Tensors with leading dimension ``batch``, float32; coordinates are those of :meth:`Instances.near_origin`
+        """
+        instances = instances.near_origin()
         return {
             "depot": instances.depot.float(),
             "tasks": instances.tasks.float().flatten(1),

@@ -13,7 +13,7 @@ from sb3_uav.envs.distances import distance_limit, euclidean
 from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 
 DEPOT = 0
 
@@ -110,7 +110,7 @@ def nearest_feasible(instances: Instances) -> th.Tensor:
         action = distance.masked_fill(~state.action_mask, th.inf).argmin(-1)
         tours.append(action)
         state, _ = dynamics.step(state, action)
-    return th.cat(tours, dim=1)
+    return th.cat(tours, dim=1) if tours else state.position
 
 
 def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
@@ -128,6 +128,7 @@ def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
 class RoutingProblem(Problem):
     """Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited."""
 
+    running_stage = Stage.FLYING
     uses_fleet = False
 
     def _action_space(self) -> spaces.Discrete:

@@ -59,10 +59,13 @@ def check_schedule(instances: Instances, row: int, schedule: Schedule) -> Schedu
 
     :param instances: The instances
     :param row: Which of them
-    :param schedule: The schedule
-    :return: Objective and tour lengths
+    :param schedule: The schedule; UAVs without a route stay in the depot
+    :return: Objective and the lengths of the given routes
     :raises InfeasibleScheduleError: If a constraint is broken; the message says which, where and by how much
+    :raises IndexError: If there is no such row
     """
+    if not -len(instances) <= row < len(instances):
+        raise IndexError(f"instance {row} of a batch of {len(instances)}")
     depot = [float(x) for x in instances.depot[row].tolist()]
     tasks = instances.tasks[row].tolist()
     values = instances.values[row].tolist()

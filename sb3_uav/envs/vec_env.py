@@ -72,8 +72,8 @@ class BatchedVecEnv(VecEnv):
     A drop-in for ``DummyVecEnv`` that steps all its episodes with one batched tensor operation.
 
     Seeded alike, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it says
-    what the problem is, and its ``Monitor``, if it has a file, logs the episodes of row 0. Every episode's statistics are in
-    ``infos[i]["episode"]``, as with ``Monitor``.
+    what the problem is, and its ``Monitor``, if it has a file, logs the episodes of all rows, as a ``VecMonitor`` would. Every
+    episode's statistics are in ``infos[i]["episode"]``, as with ``Monitor``.
 
     :param env_fns: Functions that make the environment, as for ``DummyVecEnv``; one per row
     :raises ValueError: If the functions do not make one of our environments, or wrap it in something that changes it
@@ -132,8 +132,7 @@ class BatchedVecEnv(VecEnv):
                 infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
                 for key in self._info_keywords:
                     infos[row]["episode"][key] = infos[row][key]
-            if 0 in finished:
-                self.log_episode(infos[0]["episode"])
+                self.log_episode(infos[row]["episode"])
             for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
                 counter[finished] = 0
             self.episodes.reset(finished)
@@ -146,7 +145,13 @@ class BatchedVecEnv(VecEnv):
         return {"r": round(float(episode_return), 6), "l": int(length), "t": elapsed}
 
     def log_episode(self, episode_info: dict[str, float]) -> None:
-        """Write a row to the monitor file, if there is one."""
+        """
+        Write a line to the monitor file, if there is one.
+
+        All rows write to one file, so that SB3's ``load_results`` and ``plot_results`` count all time steps.
+
+        :param episode_info: What :meth:`episode_info` returned, and the info keywords of the ``Monitor``
+        """
         if self._monitor is not None and self._monitor.results_writer is not None:
             self._monitor.results_writer.write_row(episode_info)
 
@@ -189,7 +194,7 @@ class BatchedVecEnv(VecEnv):
         figure = MapFigure()
         images = []
         for row in rows:
-            figure.draw(self.episodes.instances, row, self.episodes.routes(row))
+            figure.draw(self.episodes, row)
             images.append(figure.rgb_array())
         return images
 
@@ -199,7 +204,7 @@ class BatchedVecEnv(VecEnv):
         for row in rows:
             if row not in self._windows:
                 self._windows[row] = MapFigure(interactive=True)
-            self._windows[row].draw(self.episodes.instances, row, self.episodes.routes(row))
+            self._windows[row].draw(self.episodes, row)
             self._windows[row].show()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

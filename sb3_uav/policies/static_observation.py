@@ -41,6 +41,7 @@ class StaticObservation(NamedTuple):
     @classmethod
     def from_instances(cls, instances: Instances) -> StaticObservation:
         """:param instances: Instances on the network's device"""
+        instances = instances.near_origin()
         return cls(
             depot=instances.depot.float(),
             tasks=instances.tasks.float(),
