@@ -327,7 +327,7 @@ class REINFORCE(OnPolicyAlgorithm):
                 self.epoch = complete
 
     def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
-        """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
+        """mean((baseline - return) * sum of log-probabilities) (paper, equation (24))."""
         assert isinstance(self.policy, EpisodicPolicy) and self.problem is not None
         evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
         value_loss = None
