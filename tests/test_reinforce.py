@@ -1,7 +1,7 @@
 """What REINFORCE learns, its gradient and its baselines."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -315,4 +315,31 @@ def test_a_learning_rate_that_is_far_too_large_stops_with_an_error():
     model = make_model("router", learning_rate=1e30)
     with pytest.raises(ValueError, match="is nan in update"):
         model.learn_instances(400)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
+# ------------------------------------------------------------------------------------------ PyTorch's defaults
+
+
+@pytest.fixture
+def other_default(request: pytest.FixtureRequest) -> Iterator[None]:
+    """``float64``, or the device ``meta``, on which every use of a tensor that should be on the CPU fails."""
+    if request.param == "float64":
+        th.set_default_dtype(th.float64)
+    else:
+        th.set_default_device(request.param)
+    yield
+    th.set_default_dtype(th.float32)
+    th.set_default_device("cpu")
+
+
+@pytest.mark.parametrize("other_default", ["float64", "meta"], indirect=True)
+@pytest.mark.parametrize("baseline", BASELINES)
+@pytest.mark.parametrize("level", ["allocator", "router"])
+def test_pytorchs_default_dtype_and_device_do_not_matter(level, baseline, other_default):
+    with th.device("cpu"):
+        model = make_model(level, baseline)
+    model.learn_instances(12)
+    assert model.epoch == 1 and model.n_batches == 3
+    assert all(parameter.dtype == th.float32 for parameter in model.policy.parameters())
     assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
