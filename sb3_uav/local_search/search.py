@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from sb3_uav.common.random_streams import WARM_UP_SEED, keyed_generator, mixed_state
 from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
@@ -77,7 +78,7 @@ class LocalSearch:
         state = np.zeros(1, kernels.STATE)
         state["limit"] = self._limit
         # The generator must not start from 0.
-        state["random"] = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
+        state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
         tours = np.zeros(n_uavs, kernels.TOUR)
         for uav, route in enumerate(schedule.routes):
@@ -171,7 +172,7 @@ def warm_up() -> None:
     """
     Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
     """
-    instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
+    instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
     search.repair(search.improve(Schedule([])))
 

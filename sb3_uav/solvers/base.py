@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.counting_tasks import CountingTasks
@@ -156,7 +157,7 @@ class OneByOneSolver(Solver):
         # A row that is all padding keeps one slot, because no instance has none.
         n_tasks = max(int(counting.instances.task_mask.sum()), 1)
         reduced = replace(counting.instances.trim(n_tasks), n_uavs=counting.n_useful_uavs()[0])
-        solution = self.solve_one(reduced, time_limit, np.random.default_rng([seed, row]))
+        solution = self.solve_one(reduced, time_limit, keyed_generator(seed, row))
         schedule = counting.schedule(0, solution.schedule)
         return SolverResult(schedule, time.perf_counter() - start, bound=solution.bound)
 
