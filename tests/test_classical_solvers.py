@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ from conftest import instance_batches, seeds
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.solvers import Solver, SolverResult, limits, make_solver, milp, ortools_routing, pyvrp_search
@@ -525,7 +527,7 @@ def test_tours_that_are_just_too_long(seed: int, n_tasks: int) -> None:
 def test_packages_that_are_missing(spec: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The solver cannot be made, and the message says what to install; the others can."""
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=rf"Solver {spec} needs {package} .*; run: pip install 'sb3-uav\[{extra}\]'"):
+    with pytest.raises(ImportError, match=rf"Solver {spec} needs {package} .*; run: {re.escape(install_command(extra))}"):
         make_solver(spec)
     for other in ALL:
         if other.partition(":")[0].partition("-")[0] != spec.partition(":")[0].partition("-")[0]:

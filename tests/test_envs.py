@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 import textwrap
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env
 
 import sb3_uav
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import (
     ClusteredGenerator,
     FixedGenerator,
@@ -556,7 +558,7 @@ def test_drawing_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     env = RoutePlanningEnv(n_tasks=3, render_mode="rgb_array")
     env.reset(seed=0)
-    with pytest.raises(ImportError, match=r"Drawing needs matplotlib; run: pip install 'sb3-uav\[plots\]'"):
+    with pytest.raises(ImportError, match=f"Drawing needs matplotlib; run: {re.escape(install_command('plots'))}"):
         env.render()
 
 

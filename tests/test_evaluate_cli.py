@@ -20,6 +20,7 @@ from test_evaluation import Stub
 import sb3_uav
 from sb3_uav.cli import main as cli
 from sb3_uav.common.files import file_hash
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import BatchedVecEnv, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.evaluation.results import RESULT_COLUMNS
@@ -329,7 +330,7 @@ def test_a_package_that_goes_and_comes_back(
         context.setitem(sys.modules, packages.get(solver, "ortools.constraint_solver.pywrapcp"), None)
         assert run(*arguments) == 3
         assert "sb3-uav: best failed on 4 of 4 instances" in (message := capsys.readouterr().err)
-        assert "pip install 'sb3-uav[solvers]'" in message and statuses() == ["failed"] * 4
+        assert install_command("solvers") in message and statuses() == ["failed"] * 4
     assert run(*arguments) == 0 and statuses() == ["ok"] * 4
     with monkeypatch.context() as context:
         context.setitem(sys.modules, packages.get(solver, "ortools.constraint_solver.pywrapcp"), None)
@@ -464,9 +465,10 @@ def test_packages_that_are_not_installed(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with monkeypatch.context() as context:
         context.setitem(sys.modules, "tqdm", None)
-        assert "progress bar needs tqdm; run: pip install 'sb3-uav[solvers]'" in user_error(capsys, *common, "kmeans-nearest")
+        message = user_error(capsys, *common, "kmeans-nearest")
+        assert f"progress bar needs tqdm; run: {install_command('solvers')}" in message
     monkeypatch.setitem(sys.modules, "rich.console", None)
-    assert "pip install 'sb3-uav[solvers]'" in user_error(capsys, *common, "kmeans-nearest")
+    assert install_command("solvers") in user_error(capsys, *common, "kmeans-nearest")
     assert list(tmp_path.iterdir()) == []
 
 

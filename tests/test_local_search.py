@@ -17,6 +17,7 @@ from conftest import instance_batches, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import ClusteredGenerator, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import InfeasibleScheduleError
 from sb3_uav.local_search import kernels
@@ -316,7 +317,7 @@ except ImportError as error:
     print(error)
 """
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "pip install 'sb3-uav[solvers]'" in printed
+    assert install_command("solvers") in printed
 
 
 # ------------------------------------------------------------------------------------------------------------- K-means+VND
