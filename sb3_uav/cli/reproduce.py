@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 EPILOG = """\
 what is written:
   DIR/table1.md, .tex, .csv       the table, the paper's figures beside ours; the same for the data of figures
-  DIR/fig3.png, .pdf              the figure; fig4_curves.csv and fig5_curves.csv hold every epoch
+  DIR/fig3.png, .pdf              the figure, drawn from fig3_schedules.csv, fig4_curves.csv, fig5_curves.csv or its own table
   DIR/models/U4-N80/ITS/          allocator.zip, router.zip, its_log.csv, training.json of each pair that was trained
   DIR/training/, DIR/timing/      the zoo's own folders of the trainings; the runs that Table I times
   DIR/evaluations/                results.csv and schedules.jsonl of every situation
@@ -83,6 +83,11 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="of torch, in each training (default: its own choice; 1 with several jobs)",
     )
+    parser.add_argument(
+        "--redraw",
+        action="store_true",
+        help="train and evaluate nothing: write the tables and figures in --out again from the CSV files in it",
+    )
     parser.add_argument("--overwrite", action="store_true", help="evaluate anew; trained pairs are kept")
     return parser
 
@@ -104,11 +109,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     # What may be missing is found before the long run, not after it.
     from sb3_uav.cli.evaluate import ProgressLines
     from sb3_uav.envs.render import require_matplotlib
+    from sb3_uav.studies.reproduce.output_files import redraw
 
     require_matplotlib()
     names = [name for name in TARGETS if name in args.targets or "all" in args.targets]
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     out = args.out or Path("reproduction") / args.scale
+    if args.redraw:
+        for path in redraw(out, names):
+            print(path)
+        return 0
     try:
         with ProgressLines() as progress:
             session = make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
@@ -149,4 +159,4 @@ def make_session(
         scale, out, args.models, args.seed, args.device, args.num_threads, args.jobs, training=not args.no_training
     )
     evaluator = Evaluator(scale, out, args.seed, args.device, args.jobs, args.overwrite, progress)
-    return Session(scale, models, evaluator, args.solvers, Origin(command, scale, args.seed), out)
+    return Session(scale, models, evaluator, args.solvers, Origin.of(command, scale, args.seed), out)

@@ -35,13 +35,13 @@ def new_figure(width: float, height: float) -> Any:
     return require_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+def save_figure(figure: Any, path: Path, metadata: Mapping[str, str | None] | None = None) -> None:
     """
     Write a figure under a temporary name and rename it.
 
     :param figure: The figure
     :param path: From :func:`checked_path`; its folder is created if missing
-    :param metadata: Written into the file, under keys that its format has
+    :param metadata: Written into the file, under keys that its format has; None leaves out what is written by default
     """
     with temporary_name(path) as temporary:
         # Legends below a map lie outside its axes, which the layout does not always leave room for.

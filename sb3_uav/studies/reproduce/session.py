@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sb3_uav.studies.reproduce.evaluator import BASELINES, Evaluator
-from sb3_uav.studies.reproduce.origin import Origin, write_figure
+from sb3_uav.studies.reproduce.origin import Origin
+from sb3_uav.studies.reproduce.output_files import write_files
 from sb3_uav.studies.reproduce.pairs import Models
 from sb3_uav.studies.reproduce.scales import Scale, Scenario
-from sb3_uav.studies.reproduce.table_formats import Table, write_table
+from sb3_uav.studies.reproduce.table_formats import Table
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,14 @@ class Session:
         """Those that the paper does not have."""
         return [solver for solver in self.solvers if solver not in BASELINES]
 
-    def write_table(self, table: Table, name: str) -> list[Path]:
+    def write(self, table: Table, name: str, drawn: Table | None = None) -> list[Path]:
         """
         :param table: The table
         :param name: Of the files
+        :param drawn: What its figure is drawn from, which may be the table itself; None if it has none
         :return: The files
         """
-        return write_table(table, self.origin.lines(), self.out / name)
-
-    def write_figure(self, figure: Any, name: str) -> list[Path]:
-        """
-        :param figure: A matplotlib figure
-        :param name: Of the files
-        :return: The files
-        """
-        return write_figure(figure, self.origin, self.out / name)
+        return write_files(table, self.origin, self.out, name, drawn)
 
 
 class Notes:

@@ -33,7 +33,7 @@ from sb3_uav.studies.reproduce.paper import (
 )
 from sb3_uav.studies.reproduce.scales import Scenario, scenarios
 from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, best, number
+from sb3_uav.studies.reproduce.table_formats import Column, Table, number
 
 PAPER, OURS = "paper", "ours"
 FASTEST_SHOWN = 0.1
@@ -75,7 +75,7 @@ def table1(session: Session) -> list[Path]:
     """
     models = session.models.timed(scenarios())
     groups = [Column(source, phase) for phase in PHASES for source in (PAPER, OURS)]
-    table = Table(f"Table I: {paper_tables()['table1']['caption']}", [Column("Situation"), *groups])
+    table = Table("Table I", paper_tables()["table1"]["caption"], [Column("Situation"), *groups])
     notes = Notes(
         f"Minutes per epoch of {INSTANCES_PER_EPOCH:,} instances. The paper's: one RTX 3090, two from 300 tasks on. Ours are "
         "measured over fewer instances and multiplied; the first epoch, whose baseline is cheaper, is left out.",
@@ -91,8 +91,6 @@ def table1(session: Session) -> list[Path]:
     measured: dict[int, list[str]] = {}
     missing: list[str] = []
     for scenario in scenarios():
-        if scenario.n_tasks == SIZES[0]:
-            table.start_part()
         times = phase_times(models[scenario]) if scenario in models else None
         if times is None:
             missing.append(scenario.name)
@@ -106,7 +104,7 @@ def table1(session: Session) -> list[Path]:
     if missing:
         notes.add(f"Not trained at scale {session.scale.name}, or without the log of the training: {', '.join(missing)}.")
     table.notes = [*notes.list(), *paper_tables()["table1"]["faults"]]
-    return session.write_table(table, "table1")
+    return session.write(table, "table1")
 
 
 def _batch_size(session: Session) -> int:
@@ -165,11 +163,11 @@ def table3(session: Session) -> list[Path]:
     return _results_table(session, "table3", "Table III", 6)
 
 
-def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list[Path]:
+def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list[Path]:
     """
     :param session: What to do it with
     :param name: Of the files and of the paper's data
-    :param title: Its number
+    :param label: Its number
     :param n_uavs: The fleet
     :return: The files
     """
@@ -179,7 +177,7 @@ def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list
     blocks = {EXACT_BLOCK: EXACT_COLUMNS, FULL_BLOCK: (*FULL_COLUMNS, *extras)}
     columns = [Column(column, block) for block, methods in blocks.items() for column in methods]
     heading = [Column("Number of tasks"), Column("Measure"), Column("Source")]
-    table = Table(f"{title}: {paper_tables()[name]['caption']}", [*heading, *columns])
+    table = Table(label, paper_tables()[name]["caption"], [*heading, *columns])
     notes = Notes("Gap: to the best method of the same block, in percent. Time: wall time per instance.")
     notes.add_stand_ins(session.scale, here)
     _say_how_many(session, notes)
@@ -199,20 +197,17 @@ def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list
             }
             for block, methods in blocks.items()
         }
-        table.start_part()
-        for label, measure in MEASURES.items():
+        for title, measure in MEASURES.items():
             for source, figures in ((PAPER, papers), (OURS, ours)):
-                cells, bold = [str(scenario.n_tasks), label, source], []
+                cells = [str(scenario.n_tasks), title, source]
                 for block in blocks:
-                    if measure != "seconds":
-                        bold += [len(cells) + index for index in best(figures[block][measure], smallest=measure == "gap")]
                     show = seconds if measure == "seconds" and source == OURS else number
                     cells += [show(value) for value in figures[block][measure]]
-                table.add(cells, bold)
+                table.add(cells)
     _say_how_exact(errors, notes)
     faults = [f"The paper's table: {fault}" for fault in paper_tables()[name]["faults"]]
     table.notes = [*notes.list(), *faults]
-    return session.write_table(table, name)
+    return session.write(table, name)
 
 
 def trained_pairs(
@@ -334,7 +329,7 @@ def table4(session: Session) -> list[Path]:
     methods = (*LARGER_METHODS, *session.extra_solvers)
     columns = [Column(title, f"N={size}") for size in LARGER_SIZES for title in ("Obj.", "Time(s)")]
     heading = [Column("Fleet"), Column("Method"), Column("Source")]
-    table = Table(f"Table IV: {paper_tables()['table4']['caption']}", [*heading, *columns])
+    table = Table("Table IV", paper_tables()["table4"]["caption"], [*heading, *columns])
     labels = dict.fromkeys(model.label for model in pairs.values())
     notes = Notes(
         f"DL-DRL and DL-DRL-I: sampling, with the pairs {', '.join(labels) or '(none)'} (the paper's: U4-500, U6-500).",
@@ -345,7 +340,6 @@ def table4(session: Session) -> list[Path]:
     notes.add(f"Our instances: {counts}; the paper does not say how many it has.")
     errors: list[float] = []
     for n_uavs in dict.fromkeys(scenario.n_uavs for scenario in here):
-        table.start_part()
         ours = {size: _larger(session, Scenario(n_uavs, size), pairs, notes) for size in LARGER_SIZES}
         errors += [row.standard_error for rows in ours.values() for row in rows.values()]
         found = {
@@ -368,18 +362,16 @@ def table4(session: Session) -> list[Path]:
             for source in (PAPER, OURS):
                 if source == PAPER and method in session.extra_solvers:
                     continue
-                cells, bold = [f"U{n_uavs}", method, source], []
+                cells = [f"U{n_uavs}", method, source]
                 for size in LARGER_SIZES:
                     figures = found[source][size]
                     for measure in ("objective", "seconds"):
                         show = seconds if measure == "seconds" and source == OURS else number
-                        if position in best(figures[measure], measure == "seconds", show):
-                            bold.append(len(cells))
                         cells.append(show(figures[measure][position]))
-                table.add(cells, [column for column in bold if cells[column] != MISSING])
+                table.add(cells)
     _say_how_exact(errors, notes)
     table.notes = [*notes.list(), *paper_tables()["table4"]["faults"]]
-    return session.write_table(table, "table4")
+    return session.write(table, "table4")
 
 
 def _larger(
