@@ -172,7 +172,7 @@ def test_variants_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[1, 2]", "must be a mapping from names"),
+        ("[1, 2]", r"variants\.yml: holds \[1, 2\] \(list\) instead of a mapping"),
         ("{}", "must be a mapping from names"),
         ("a: {n_envs: 3}", "at least the key 'algo'"),
         ("a: {algo: dqn}", r"algo 'dqn': there is no YAML zoo_configs/dqn\.yml; name one as conf_file"),

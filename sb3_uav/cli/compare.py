@@ -7,6 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.optional import require
+from sb3_uav.zoo.dependencies import require_zoo
+
 
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -66,6 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     settings = vars(make_parser().parse_args(arguments))
+    # What may be missing is found before the long run, not after it.
+    require_zoo("A comparison")
+    require("matplotlib.figure", "A comparison", "plots")
     from sb3_uav.studies.compare.study import Settings, run_study
 
     report_only = settings.pop("report_only")

@@ -7,7 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.optional import require
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id
+from sb3_uav.zoo.dependencies import require_zoo
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,6 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     args, train_args = parser.parse_known_args(argv)
 
+    # What may be missing is found before the training, not after it.
+    require_zoo("The demo", "rich.console", "tensorboard")
+    require("matplotlib.figure", "The demo", "plots")
     from sb3_uav.studies.demo import evaluate_run, newest_run
     from sb3_uav.zoo.train import train
 

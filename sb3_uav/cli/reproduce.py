@@ -12,8 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_uav.common.optional import require
 from sb3_uav.studies.reproduce.scales import SCALES
 from sb3_uav.studies.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
+from sb3_uav.zoo.dependencies import require_zoo
 
 if TYPE_CHECKING:
     from sb3_uav.studies.reproduce.session import Session
@@ -107,18 +109,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ValueError(f"{name} is {value}; it must be at least {least}.")
     check_solvers(args.solvers)
     # What may be missing is found before the long run, not after it.
-    from sb3_uav.cli.evaluate import ProgressLines
-    from sb3_uav.envs.render import require_matplotlib
-    from sb3_uav.studies.reproduce.output_files import redraw
-
-    require_matplotlib()
+    require("matplotlib.figure", "Reproducing the paper's figures", "plots")
     names = [name for name in TARGETS if name in args.targets or "all" in args.targets]
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     out = args.out or Path("reproduction") / args.scale
     if args.redraw:
+        from sb3_uav.studies.reproduce.output_files import redraw
+
         for path in redraw(out, names):
             print(path)
         return 0
+    require_zoo("Reproducing the paper's tables")
+    from sb3_uav.cli.evaluate import ProgressLines
+
     try:
         with ProgressLines() as progress:
             session = make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)

@@ -30,6 +30,29 @@ ZOO_KEYS = {
 }
 
 
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """
+    :param path: A YAML file
+    :return: The mapping in it
+    :raises FileNotFoundError: If there is no such file
+    :raises ValueError: If it cannot be read, or holds no mapping; the message names the file
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file.")
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    # ValueError: bytes that are no UTF-8, and dates that do not exist. RecursionError: brackets without end.
+    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read as YAML: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: holds {_kind(found)} instead of a mapping; write `name: settings`.")
+    return found
+
+
+def _kind(value: Any) -> str:
+    return "nothing" if value is None else f"{value!r:.40} ({type(value).__name__})"
+
+
 def default_config(algo: str, env_id: str | None = None) -> Path | None:
     """
     :param algo: Name of an algorithm
@@ -40,12 +63,7 @@ def default_config(algo: str, env_id: str | None = None) -> Path | None:
     package = Path(sb3_uav.__file__).parent
     candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
     ours = next((path for path in candidates if path.is_file()), None)
-    if (
-        ours is not None
-        and env_id is not None
-        and stock_config(algo).is_file()
-        and env_id not in yaml.safe_load(ours.read_text())
-    ):
+    if ours is not None and env_id is not None and stock_config(algo).is_file() and env_id not in read_yaml(ours):
         return None
     return ours
 
@@ -73,10 +91,39 @@ def check_keys(found: set[str], algorithm: type, where: str) -> None:
     :raises ValueError: On a key that neither knows
     """
     known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
-    for key in sorted(found - known):
-        nearest = difflib.get_close_matches(key, known, n=1)
+    for key in sorted(found - known, key=str):
+        nearest = difflib.get_close_matches(str(key), known, n=1)
         advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."
         raise ValueError(f"{where}: unknown key {key!r}; {advice}")
+
+
+def check_values(entry: dict[str, Any], where: str) -> None:
+    """
+    Check what rl_zoo3 would stumble over without saying which key it was.
+
+    :param entry: A YAML entry
+    :param where: File and entry, named in the error
+    :raises ValueError: If a value is of the wrong kind
+    """
+    for key in ("n_envs", "n_timesteps"):
+        value = entry.get(key, 1)
+        whole = isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer()
+        if not whole or value < 1:
+            raise ValueError(f"{where}: {key} is {_kind(value)}; write a whole number, at least 1.")
+    if not isinstance(entry.get("policy"), str):
+        raise ValueError(f"{where}: policy is {_kind(entry.get('policy'))}; write the name of a policy.")
+    for key in ("policy_kwargs", "env_kwargs", "monitor_kwargs"):
+        value = entry.get(key)
+        # rl_zoo3 evaluates texts such as "dict(net_arch=[64])".
+        if not (value is None or isinstance(value, dict) or (isinstance(value, str) and re.match(r"\s*(dict\(|\{)", value))):
+            raise ValueError(f"{where}: {key} is {_kind(value)}; write a mapping.")
+    callbacks = entry.get("callback") or []
+    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
+        if not isinstance(callback, str) and not (isinstance(callback, dict) and len(callback) == 1):
+            raise ValueError(f"{where}: callback holds {_kind(callback)}; write a dotted name, or one with its arguments.")
+        for arguments in callback.values() if isinstance(callback, dict) else ():
+            if not isinstance(arguments, dict):
+                raise ValueError(f"{where}: the arguments of a callback are {_kind(arguments)}; write a mapping.")
 
 
 def parse_schedule(key: str, text: str) -> float | LinearSchedule:

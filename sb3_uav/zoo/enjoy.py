@@ -12,6 +12,7 @@ from typing import Any
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
+from sb3_uav.zoo.dependencies import require_zoo
 
 PROG = "sb3-uav enjoy"
 
@@ -25,6 +26,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that replays need is not installed
     """
+    require_zoo("Replaying a trained agent", "rl_zoo3.enjoy")
     from sb3_uav.zoo.experiment import make_batched_vec_env, register_algorithms
     from sb3_uav.zoo.rl_zoo3_compat import command_line, default_vec_env, replay_environment
 

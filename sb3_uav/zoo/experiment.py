@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import yaml
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -18,10 +17,15 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
-from sb3_uav.zoo.configs import check_keys, parse_schedule, plain_numbers
+from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
+# What values of the wrong kind lead to, while callbacks, environments and the algorithm are made of them.
+SETUP_ERRORS = (
+    *(TypeError, AttributeError, AssertionError, ModuleNotFoundError, NameError, SyntaxError, LookupError, ArithmeticError),
+    *(RuntimeError, MemoryError),
+)
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
 
 
@@ -66,21 +70,38 @@ class UAVExperimentManager(ExperimentManager):
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
         register_search_spaces(self.env_name.gym_id)
 
+    @property
+    def _where(self) -> str:
+        """File and entry, as errors name them."""
+        return f"{self.config}, {self.env_name.gym_id}"
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        try:
-            hyperparams, saved = super().read_hyperparameters()
-        except (yaml.YAMLError, FileNotFoundError) as error:
-            raise ValueError(f"{self.config}: cannot be read: {error}") from error
+        if str(self.config).endswith((".yml", ".yaml")):
+            read_yaml(Path(self.config))
+        hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
-        check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], f"{self.config}, {self.env_name.gym_id}")
-        return {key: plain_numbers(value) for key, value in hyperparams.items()}, saved
+        check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
+        hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
+        check_values(hyperparams, self._where)
+        return hyperparams, saved
 
     def setup_experiment(self) -> Any:
         try:
             return super().setup_experiment()
-        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
-            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+        except SETUP_ERRORS as error:
+            raise ValueError(f"{self._where}: {_described(error)}") from error
+        except ValueError as error:
+            if str(self.config) in str(error):
+                raise
+            raise ValueError(f"{self._where}: {error}") from error
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        try:
+            super().learn(model)
+        except (TypeError, OverflowError) as error:
+            # A value of the wrong type may be used in training only.
+            raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         env = super().create_envs(n_envs, eval_env, no_log)
@@ -92,7 +113,9 @@ class UAVExperimentManager(ExperimentManager):
         try:
             processed = super()._preprocess_hyperparams(hyperparams)
         except TypeError as error:
-            raise ValueError(f"{self.config}: an argument of 'callback' does not fit: {error}") from error
+            raise ValueError(f"{self._where}: an argument of 'callback' does not fit: {error}") from error
+        if not isinstance(hyperparams.get("policy_kwargs") or {}, dict):
+            raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         if not self.eval_freq_given:
@@ -146,8 +169,8 @@ class UAVExperimentManager(ExperimentManager):
         except (RuntimeError, FloatingPointError) as error:
             # rl_zoo3 takes ValueError and AssertionError in training for divergence; torch also raises these.
             raise optuna.exceptions.TrialPruned(str(error)) from error
-        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
-            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+        except SETUP_ERRORS as error:
+            raise ValueError(f"{self._where}: {_described(error)}") from error
         if not math.isfinite(mean_reward):
             raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
         return mean_reward
@@ -157,6 +180,11 @@ class UAVExperimentManager(ExperimentManager):
         """The interactive training strategy of this run, if it has one."""
         found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
         return found[0] if found else None
+
+
+def _described(error: Exception) -> str:
+    """What went wrong, with the kind of error where its text alone would say little."""
+    return str(error) if isinstance(error, TypeError | AssertionError | ImportError) else f"{type(error).__name__}: {error}"
 
 
 def is_fixed_set_evaluation(entry: Any) -> bool:

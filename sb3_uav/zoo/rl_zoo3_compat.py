@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sb3_uav.common.optional import install_command
+
 try:
     import optuna  # noqa: F401  (rl_zoo3 imports it; a missing one is reported here too)
     import rl_zoo3
@@ -19,7 +21,7 @@ try:
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 except ImportError as error:
-    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
+    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: {install_command('zoo')}") from error
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv

@@ -13,7 +13,6 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import SHARED_SEED
 from sb3_uav.envs import Instances
 from sb3_uav.envs.allocation import AllocationProblem
-from sb3_uav.envs.render import require_matplotlib
 from sb3_uav.studies.compare.common_ground import (
     ROUTER_FILE,
     VALIDATION_FILE,
@@ -40,8 +39,6 @@ def run_study(settings: Settings, arguments: Sequence[str], report_only: bool = 
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If matplotlib is not installed
     """
-    # What may be missing or wrong is found before the long run, not after it.
-    require_matplotlib()
     problem = make_problem(settings.env)
     variants = read_variants(settings.variants, settings.env)
     needs_router = isinstance(problem, AllocationProblem) and not settings.its

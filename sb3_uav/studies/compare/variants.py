@@ -6,9 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from sb3_uav.zoo.configs import default_config, plain_numbers
+from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
 SHARED_SAMPLES = 8
@@ -46,11 +44,8 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     path = default_config(algo) if conf_file is None else Path(conf_file)
     if path is None or not path.is_file():
         raise ValueError(f"algo {algo!r}: there is no YAML {path or f'zoo_configs/{algo}.yml'}; name one as conf_file.")
-    try:
-        entries = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
+    entries = read_yaml(path)
+    if not isinstance(entries.get(env_id), dict):
         raise ValueError(f"{path}: has no entry for {env_id}; add one, or compare on another environment.")
     return plain_numbers(entries[env_id])
 
@@ -88,17 +83,8 @@ def read_variants(path: Path | None, env_id: str) -> list[Variant]:
     :return: The variants with the entries of their YAMLs, as they stand there but for what the variants replace
     :raises ValueError: If something is missing or not allowed; the message names it
     """
-    if path is None:
-        given = default_variants(env_id)
-    else:
-        if not path.is_file():
-            raise FileNotFoundError(f"--variants {path}: no such file.")
-        try:
-            given = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ValueError(f"--variants {path}: cannot be read: {error}") from error
-    changes_of = list(given.values()) if isinstance(given, dict) else []
-    if not changes_of or not all(isinstance(changes, dict) and "algo" in changes for changes in changes_of):
+    given = default_variants(env_id) if path is None else read_yaml(path)
+    if not given or not all(isinstance(changes, dict) and isinstance(changes.get("algo"), str) for changes in given.values()):
         raise ValueError(f"--variants {path}: must be a mapping from names to mappings with at least the key 'algo'.")
     variants = []
     for name, changes in given.items():

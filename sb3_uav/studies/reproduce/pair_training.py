@@ -89,12 +89,12 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     :return: The zoo's YAML entry of the scenario with the changes of the recipe
     :raises FileNotFoundError: If the zoo's YAML is missing
     """
-    from sb3_uav.zoo.configs import default_config, plain_numbers
+    from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
     config = default_config("reinforce")
     if config is None:
         raise FileNotFoundError("reinforce.yml: not found; install sb3-uav again.")
-    shipped = yaml.safe_load(config.read_text(encoding="utf-8"))[allocation_id(scenario.n_uavs, scenario.n_tasks)]
+    shipped = read_yaml(config)[allocation_id(scenario.n_uavs, scenario.n_tasks)]
     entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
     its = entry["callback"][0][ITS_KEY]
     its |= {**recipe.its, "strategy": strategy, "verbose": 1}
