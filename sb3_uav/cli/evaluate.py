@@ -106,9 +106,8 @@ def make_solvers(args: argparse.Namespace) -> list[Solver]:
     :raises FileNotFoundError: If a zip is missing
     :raises ValueError: If a zip is damaged, or another argument is not allowed
     """
-    from sb3_uav.evaluation.run import UnavailableSolver
-    from sb3_uav.solvers.base import make_solver
-    from sb3_uav.solvers.limits import UnavailableError
+    from sb3_uav.solvers import make_solver
+    from sb3_uav.solvers.unavailable import UnavailableError, UnavailableSolver
 
     if (args.allocator is None) != (args.router is None):
         missing = "--allocator" if args.allocator is None else "--router"

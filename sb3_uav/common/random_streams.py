@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import torch as th
 
 # Which numbers are drawn. The streams are disjoint, from each other and from generators that were seeded with a plain number.
 TRAINING_STREAM, HELD_OUT_STREAM, ACTION_STREAM, SUBSET_STREAM, FIXED_SET_STREAM, FIXED_SET_ACTION_STREAM = range(6)
@@ -29,3 +32,33 @@ def random_stream(seed: int, *key: int) -> np.random.Generator:
     """
     # Not default_rng([seed, *key]): trailing zeros would not count there, so that [0, 0] and 0 give the same numbers.
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
+
+def torch_generator(rng: np.random.Generator, device: th.device | str) -> th.Generator:
+    """
+    :param rng: Source of the seed; one number is drawn from it
+    :param device: Where random numbers are needed
+    :return: A generator that PyTorch's sampling functions accept on this device
+    """
+    return th.Generator(device).manual_seed(int(rng.integers(2**63 - 1)))
+
+
+def draw_seed() -> int:
+    """
+    :return: A seed that differs from call to call, whatever the state of the global generators
+    """
+    return int(np.random.SeedSequence().generate_state(1)[0])
+
+
+def stream_seed(model: Any) -> int:
+    """
+    The seed of an algorithm's random streams, drawn at the first call if the algorithm has none.
+
+    It is kept in ``model.stream_seed``, a plain number that SB3 saves in the zip, so that a resumed run has the same streams.
+
+    :param model: Any SB3 algorithm
+    :return: The seed
+    """
+    if getattr(model, "stream_seed", None) is None:
+        model.stream_seed = draw_seed() if model.seed is None else model.seed
+    return model.stream_seed

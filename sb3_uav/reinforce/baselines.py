@@ -4,22 +4,47 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.logger import Logger
 
 from sb3_uav.common.random_streams import HELD_OUT_STREAM, random_stream
 from sb3_uav.common.statistics import significantly_positive
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 
-if TYPE_CHECKING:
-    from sb3_uav.reinforce.reinforce import REINFORCE
-
-
 # How many test instances are decoded at once: the smaller of the paper's batches.
 TEST_ROWS = 256
+
+
+class Learner(Protocol):
+    """
+    What baselines use of the algorithm that they belong to.
+
+    :param policy: The policy that learns
+    :param baseline_policy: A copy of it for greedy episodes, if the baseline needs one
+    :param baseline_state: What a baseline keeps between runs, plain data
+    :param epoch: Number of complete epochs
+    :param stream_seed: Seed of the random streams
+    :param device: Device of the policy
+    :param logger: SB3's logger
+    """
+
+    baseline_state: dict[str, Any]
+    epoch: int
+    stream_seed: int
+    device: th.device
+
+    @property
+    def policy(self) -> Any: ...
+
+    @property
+    def baseline_policy(self) -> Any: ...
+
+    @property
+    def logger(self) -> Logger: ...
 
 
 class Baseline(ABC):
@@ -29,13 +54,13 @@ class Baseline(ABC):
     Whatever it must remember between runs it keeps in ``model.baseline_state`` (plain data) or in a module that the model
     saves.
 
-    :param model: The algorithm
+    :param model: The algorithm, usually :class:`~sb3_uav.reinforce.REINFORCE`
     """
 
     # Whether whole episodes on known instances are needed, which only the fused driver has.
     needs_episodes = False
 
-    def __init__(self, model: REINFORCE) -> None:
+    def __init__(self, model: Learner) -> None:
         self.model = model
 
     @abstractmethod
@@ -82,7 +107,7 @@ class ExponentialBaseline(Baseline):
     :param beta: Weight of the past
     """
 
-    def __init__(self, model: REINFORCE, beta: float = 0.8) -> None:
+    def __init__(self, model: Learner, beta: float = 0.8) -> None:
         super().__init__(model)
         if not 0 <= beta < 1:
             raise ValueError(f"beta of the exponential baseline is {beta}; it must be >= 0 and < 1.")
@@ -140,7 +165,7 @@ class RolloutBaseline(Baseline):
 
     def __init__(
         self,
-        model: REINFORCE,
+        model: Learner,
         warmup_epochs: int = 1,
         beta: float = 0.8,
         n_test_instances: int = 10_000,

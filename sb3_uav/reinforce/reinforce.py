@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import math
 import pathlib
 from collections.abc import Iterable
 from copy import deepcopy
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -24,39 +23,27 @@ from stable_baselines3.common.policies import (
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, random_stream
+from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.envs.instances import Instances, training_batch
+from sb3_uav.envs.generators import training_batch
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
+from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
-from sb3_uav.policies.base import Cache
+from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
+from sb3_uav.reinforce.episode_batch import EpisodeBatch, steps_of_episodes
+from sb3_uav.reinforce.recognition import find_problem
 
-SelfREINFORCE = TypeVar("SelfREINFORCE", bound="REINFORCE")
+SelfT = TypeVar("SelfT", bound="REINFORCE")
 
 # Larger than any run; learn_instances stops by instances, not by steps.
 NO_STEP_LIMIT = 2**62
-
-
-class EpisodeBatch(NamedTuple):
-    """
-    Complete episodes waiting for the gradient pass.
-
-    :param instances: ``batch`` instances
-    :param cache: Their encodings, with gradients
-    :param actions: ``(batch, n_samples, n_steps)`` int64
-    :param returns: ``(batch, n_samples)`` float64
-    :param baseline: Broadcastable against ``returns``
-    """
-
-    instances: Instances
-    cache: Cache
-    actions: th.Tensor
-    returns: th.Tensor
-    baseline: th.Tensor
+# Settings of SB3's on-policy algorithms that REINFORCE has no use for: rewards to go are not mixed with value estimates, and
+# actions are discrete.
+NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
 class REINFORCE(OnPolicyAlgorithm):
@@ -134,19 +121,17 @@ class REINFORCE(OnPolicyAlgorithm):
             learning_rate=learning_rate,
             n_steps=n_steps,
             gamma=gamma,
-            gae_lambda=1.0,
             ent_coef=ent_coef,
             vf_coef=vf_coef,
+            **NOT_OFFERED,
             max_grad_norm=max_grad_norm,
-            use_sde=False,
-            sde_sample_freq=-1,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
             verbose=verbose,
+            supported_action_spaces=(spaces.Discrete,),
             seed=seed,
             device=device,
-            supported_action_spaces=(spaces.Discrete,),
             _init_setup_model=False,
         )
         self.n_samples = n_samples
@@ -156,7 +141,7 @@ class REINFORCE(OnPolicyAlgorithm):
         self.lr_decay = lr_decay
         self.normalize_advantage = normalize_advantage
         # All that a resumed run needs to go on as if it had not been interrupted.
-        self.stream_seed = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+        self.stream_seed = draw_seed() if seed is None else seed
         self.baseline_state: dict[str, Any] = {}
         self.baseline_policy: EpisodicPolicy | None = None
         self.n_batches = 0
@@ -234,8 +219,7 @@ class REINFORCE(OnPolicyAlgorithm):
         :param counter: Number of the update, from 0
         :return: The source of its sampled actions, on the device of the policy
         """
-        seed = int(random_stream(self.stream_seed, ACTION_STREAM, counter).integers(2**63 - 1))
-        return th.Generator(self.device).manual_seed(seed)
+        return torch_generator(random_stream(self.stream_seed, ACTION_STREAM, counter), self.device)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
@@ -249,27 +233,14 @@ class REINFORCE(OnPolicyAlgorithm):
             rollout_buffer.buffer_size = n_rollout_steps
         if not super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps):
             return False
-        self._compute_step_advantages(rollout_buffer)
-        return True
-
-    def _compute_step_advantages(self, rollout_buffer: RolloutBuffer) -> None:
-        """Replace the buffer's advantages by return minus baseline, and by 0 in episodes that have not ended."""
-        if self.baseline != "critic":
-            assert self._last_episode_starts is not None
-            ended_after = np.vstack([rollout_buffer.episode_starts[1:], self._last_episode_starts]).astype(bool)
-            complete = np.logical_or.accumulate(ended_after[::-1])[::-1]
-        else:
+        if self.baseline == "critic":
             # The critic bootstraps what lies behind the end of the buffer.
             complete = np.ones_like(rollout_buffer.returns, dtype=bool)
-        advantages = np.zeros_like(rollout_buffer.advantages)
-        if complete.any():
-            returns = np.where(complete, rollout_buffer.returns, np.nan)
-            gain = (returns - self._baseline.of_steps(returns, rollout_buffer.values))[complete]
-            if self.normalize_advantage:
-                gain = (gain - gain.mean()) / (gain.std() + 1e-8)
-            # The mean over the buffer becomes the mean over complete episodes.
-            advantages[complete] = gain * (complete.size / complete.sum())
-        rollout_buffer.advantages = advantages
+        else:
+            assert self._last_episode_starts is not None
+            complete = complete_steps(rollout_buffer, self._last_episode_starts)
+        rollout_buffer.advantages = step_advantages(rollout_buffer, complete, self._baseline, self.normalize_advantage)
+        return True
 
     def _collect_episodes(self, problem: Problem, env: VecEnv, callback: BaseCallback) -> bool:
         """Play ``n_samples`` complete episodes on each of ``n_envs`` new instances."""
@@ -304,23 +275,16 @@ class REINFORCE(OnPolicyAlgorithm):
         :return: False if a callback wants to stop
         """
         batched = env.unwrapped if isinstance(env.unwrapped, BatchedVecEnv) else None
-        for sample in range(self.n_samples):
-            n_calls = math.ceil(lengths[:, sample].sum() / self.n_envs)
-            for call in range(n_calls):
-                last = call == n_calls - 1
-                dones = np.full(len(returns), last)
-                rewards = returns[:, sample].astype(np.float32) if last else np.zeros(len(returns), dtype=np.float32)
-                infos: list[dict[str, Any]] = [{} for _ in range(len(returns))]
-                if last:
-                    for info, episode_return, length in zip(infos, returns[:, sample], lengths[:, sample], strict=True):
-                        info["episode"] = {"r": float(episode_return), "l": int(length)}
-                    if batched is not None:
-                        batched.log_episode(batched.episode_info(returns[0, sample], lengths[0, sample]))
-                self.num_timesteps += self.n_envs
-                callback.update_locals(locals())
-                if not callback.on_step():
-                    return False
-            self._update_info_buffer(infos, dones)
+        # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
+        for rewards, dones, infos in steps_of_episodes(returns, lengths, self.n_envs):  # noqa: B007
+            if dones.all() and batched is not None:
+                batched.log_episode(batched.episode_info(infos[0]["episode"]["r"], infos[0]["episode"]["l"]))
+            self.num_timesteps += self.n_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            if dones.all():
+                self._update_info_buffer(infos, dones)
         return True
 
     def train(self) -> None:
@@ -350,37 +314,26 @@ class REINFORCE(OnPolicyAlgorithm):
         """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
         assert isinstance(self.policy, EpisodicPolicy) and self.problem is not None
         evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
-        advantages = (batch.returns - batch.baseline).float()
         value_loss = None
         if self.baseline == "critic":
             # Steps after the end of an episode belong to nobody.
             lengths = self.problem.lengths(batch.instances, batch.actions)
             real = th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
-            to_go, values = self._rewards_to_go(batch)[real], evaluation.values[real]
+            to_go, values = batch.rewards_to_go(self.problem)[real], evaluation.values[real]
             value_loss = ((to_go - values) ** 2).mean()
-            advantages = to_go - values.detach()
             variance = explained_variance(values.detach().cpu().numpy(), to_go.cpu().numpy())
             self.logger.record("train/explained_variance", float(variance))
             weighted = th.zeros_like(evaluation.log_prob)
-            weighted[real] = self._normalized(advantages) * evaluation.log_prob[real]
+            weighted[real] = self._normalized(to_go - values.detach()) * evaluation.log_prob[real]
         else:
             self.logger.record("train/baseline", batch.baseline.mean().item())
-            weighted = self._normalized(advantages)[..., None] * evaluation.log_prob
+            advantages = self._normalized((batch.returns - batch.baseline).float())
+            weighted = advantages[..., None] * evaluation.log_prob
         policy_loss = -weighted.sum(-1).mean()
         return self._total_loss(policy_loss, evaluation.entropy.sum(-1).mean(), value_loss)
 
     def _normalized(self, advantages: th.Tensor) -> th.Tensor:
-        # A single advantage has no standard deviation, and would turn all weights to NaN.
-        if not self.normalize_advantage or advantages.numel() < 2:
-            return advantages
-        return advantages / (advantages.std() + 1e-8)
-
-    def _rewards_to_go(self, batch: EpisodeBatch) -> th.Tensor:
-        """``(batch, n_samples, n_steps)`` float32: what each step's action and those after it collect."""
-        problem = self.problem
-        assert problem is not None
-        collected = problem.step_rewards(batch.instances, batch.actions, batch.returns)
-        return collected.flip(-1).cumsum(-1).flip(-1).float()
+        return scale_advantages(advantages) if self.normalize_advantage else advantages
 
     def _step_loss(self) -> th.Tensor:
         data = next(self.rollout_buffer.get(batch_size=None))
@@ -408,23 +361,19 @@ class REINFORCE(OnPolicyAlgorithm):
             self.logger.record("train/learning_rate", optimizer.param_groups[0]["lr"])
 
     def learn(
-        self: SelfREINFORCE,
+        self: SelfT,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str = "REINFORCE",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfREINFORCE:
+    ) -> SelfT:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def learn_instances(
-        self: SelfREINFORCE,
-        n_instances: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "REINFORCE",
-    ) -> SelfREINFORCE:
+        self: SelfT, n_instances: int, callback: MaybeCallback = None, log_interval: int = 1, tb_log_name: str = "REINFORCE"
+    ) -> SelfT:
         """
         Go on learning for a number of instances, whatever the number of steps they take (fused driver only).
 
@@ -473,22 +422,3 @@ class REINFORCE(OnPolicyAlgorithm):
         if self.baseline == "rollout":
             state_dicts = [*state_dicts, "baseline_policy"]
         return state_dicts, variables
-
-
-def find_problem(env: VecEnv) -> Problem | None:
-    """
-    :param env: The environment of an algorithm
-    :return: The problem behind it; None if it is not one of ours, or wrapped in something that changes what it does
-    """
-    while isinstance(env, VecMonitor):
-        env = env.venv
-    if isinstance(env, BatchedVecEnv):
-        return env.problem
-    if isinstance(env, DummyVecEnv):
-        problem_envs = [unwrap_problem_env(row) for row in env.envs]
-        problems = [row.problem for row in problem_envs if row is not None]
-        # One problem stands for all rows only if all rows have the same instances and rewards.
-        kinds = [(problem.generator, getattr(problem, "router", None)) for problem in problems]
-        if len(problems) == len(problem_envs) and all(kind == kinds[0] for kind in kinds):
-            return problems[0]
-    return None

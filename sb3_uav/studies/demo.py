@@ -11,12 +11,13 @@ import numpy as np
 
 from sb3_uav.common.random_streams import TEST_SEED
 from sb3_uav.envs import TaskAllocationEnv
-from sb3_uav.evaluation.run import RESULTS_FILE, evaluate, print_table
+from sb3_uav.evaluation import evaluate, print_table
+from sb3_uav.evaluation.results import RESULTS_FILE
 from sb3_uav.plots.learning_curves import plot_learning_curves
 from sb3_uav.plots.schedule_map import MapPanel, plot_schedules
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.solvers.base import Solver, make_solver
+from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.dl_drl import DLDRL
 from sb3_uav.training.its import LOG_FILE
 

@@ -7,7 +7,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sb3_uav.evaluation.results import describe_machine
+from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.studies.reproduce.paper import paper_tables
 from sb3_uav.studies.reproduce.scales import Scale
 

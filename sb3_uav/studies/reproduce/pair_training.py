@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from sb3_uav.common.files import replaced_when_complete
-from sb3_uav.evaluation.results import describe_machine
+from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
 from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
 

@@ -26,7 +26,7 @@ def check_solvers(names: Sequence[str]) -> None:
     :param names: Of ``--solvers``
     :raises ValueError: If one is not the name of a solver that needs no zips, or is given twice
     """
-    from sb3_uav.solvers.base import SOLVERS
+    from sb3_uav.solvers import SOLVERS
 
     known = sorted(set(SOLVERS) - {"dl-drl", "dl-drl-i"})
     for name in names:

@@ -1,0 +1,77 @@
+"""
+The one place that touches private attributes of Stable-Baselines3's objects from outside.
+
+Overriding a documented hook in a subclass is not listed here. Each function links the upstream code that it relies on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+
+def n_updates(model: BaseAlgorithm) -> int:
+    """
+    Number of updates so far; PPO counts its epochs over a rollout, A2C and REINFORCE their optimizer steps.
+
+    ``self._n_updates`` in https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+
+    :param model: Any SB3 algorithm
+    :return: Its number of updates, kept in its zip
+    """
+    return model._n_updates
+
+
+def total_timesteps(model: BaseAlgorithm) -> int:
+    """
+    The number of steps at which the running ``learn`` stops.
+
+    ``_setup_learn`` in https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+
+    :param model: Any SB3 algorithm
+    :return: Its ``total_timesteps``, earlier calls of ``learn`` included; 0 before the first
+    """
+    return model._total_timesteps
+
+
+def set_last_observation(model: OnPolicyAlgorithm, observation: np.ndarray | dict[str, np.ndarray]) -> None:
+    """
+    Tell an algorithm that its environment has been reset from outside.
+
+    ``_setup_learn`` does the same after its own reset:
+    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+
+    :param model: An on-policy algorithm
+    :param observation: What ``reset`` of its environment returned
+    """
+    model._last_obs = observation
+    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
+
+
+def forget_last_observation(model: OnPolicyAlgorithm) -> None:
+    """
+    Make the next ``learn`` reset the environment, even with ``reset_num_timesteps=False``.
+
+    ``set_env`` with ``force_reset`` does the same:
+    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+
+    :param model: An on-policy algorithm
+    """
+    model._last_obs = None
+
+
+def constructor_parameters(policy: BasePolicy) -> dict[str, Any]:
+    """
+    The arguments that build another policy of the same architecture.
+
+    ``BaseModel._get_constructor_parameters``, used by ``save`` and ``load`` of policies:
+    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/policies.py
+
+    :param policy: Any SB3 or sb3-contrib policy
+    :return: Keyword arguments for its class
+    """
+    return policy._get_constructor_parameters()
