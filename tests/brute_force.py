@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sb3_uav.envs import Instances
-from sb3_uav.envs.instances import DISTANCE_TOLERANCE
+from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 
 
 def largest_value(instances: Instances, row: int = 0) -> float:

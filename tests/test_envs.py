@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import subprocess
-import sys
-import textwrap
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +9,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import instance_batches, random_legal, seeds
+from conftest import instance_batches, seeds
+from env_helpers import (
+    act,
+    both_levels,
+    make,
+    overwrite,
+    play,
+    rendered,
+)
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.env_checker import check_env
 
-import sb3_uav
 from sb3_uav.envs import (
     ClusteredGenerator,
     FixedGenerator,
@@ -35,142 +35,8 @@ from sb3_uav.envs import (
     nearest_feasible,
 )
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.registration import register_envs
 
-PAPER_SIZES = (80, 100, 150, 200, 300, 500)
 SMALL_IDS = ["TaskAllocation-U3-N20-v0", "RoutePlanning-N20-v0"]
-both_levels = pytest.mark.parametrize("level", ["routing", "allocation"])
-
-
-def make(level: str, **kwargs: Any) -> ProblemEnv:
-    return RoutePlanningEnv(**kwargs) if level == "routing" else TaskAllocationEnv(**kwargs)
-
-
-def act(env: ProblemEnv, rng: np.random.Generator) -> int:
-    """A random legal action."""
-    return int(random_legal(th.from_numpy(env.action_masks()), rng))
-
-
-def play(env: ProblemEnv, rng: np.random.Generator, **reset_kwargs: Any) -> tuple[list[dict[str, np.ndarray]], list[float]]:
-    """The observations and rewards of one episode of random legal actions."""
-    observation, _ = env.reset(**reset_kwargs)
-    observations, rewards = [observation], []
-    while True:
-        observation, reward, terminated, truncated, info = env.step(act(env, rng))
-        assert observation in env.observation_space and not truncated
-        observations.append(observation)
-        rewards.append(float(reward))
-        assert ("objective" in info) == terminated
-        if terminated:
-            assert info["illegal_actions"] == 0 and info["objective"] == pytest.approx(sum(rewards))
-            return observations, rewards
-
-
-def rendered(env: ProblemEnv) -> np.ndarray:
-    image = env.render()
-    assert image is not None
-    return image
-
-
-# Registration
-
-
-def test_every_scenario_of_the_paper_is_registered() -> None:
-    for n_tasks in PAPER_SIZES:
-        routing = gym.spec(f"RoutePlanning-N{n_tasks}-v0").make().unwrapped
-        assert isinstance(routing, RoutePlanningEnv) and routing.problem.generator == UniformGenerator(n_tasks, 1, 2.0)
-        for n_uavs in (4, 6):
-            allocation = gym.spec(f"TaskAllocation-U{n_uavs}-N{n_tasks}-v0").make().unwrapped
-            assert isinstance(allocation, TaskAllocationEnv)
-            assert allocation.problem.generator == UniformGenerator(n_tasks, n_uavs, 2.0)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "n_tasks", "n_actions", "max_distance"),
-    [
-        ("TaskAllocation-U3-N20-v0", 20, 3, 1.5),
-        ("TaskAllocation-U4-N80-v0", 80, 4, 2.0),
-        ("TaskAllocation-U6-N500-v0", 500, 6, 2.0),
-        ("RoutePlanning-N20-v0", 20, 21, 1.5),
-        ("RoutePlanning-N300-v0", 300, 301, 2.0),
-    ],
-)
-def test_ids_make_what_they_say(env_id: str, n_tasks: int, n_actions: int, max_distance: float) -> None:
-    """The benchmark's instances: D = 2 (less in the demo), unit square, unit values."""
-    env = gym.make(env_id)
-    assert isinstance(env.action_space, gym.spaces.Discrete) and env.action_space.n == n_actions
-    env.reset(seed=0)
-    problem_env = env.unwrapped
-    assert isinstance(problem_env, ProblemEnv)
-    instance = problem_env.instance
-    assert instance.n_tasks == n_tasks and instance.max_distance.tolist() == [max_distance]
-    assert (instance.values == 1).all() and instance.tasks.min() >= 0 and instance.tasks.max() <= 1
-
-
-def test_registering_again_changes_nothing() -> None:
-    before = dict(gym.registry)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        register_envs()
-    assert gym.registry == before
-
-
-def test_import_registers_and_does_nothing_else(tmp_path: Path) -> None:
-    """In a fresh process: no heavy module, no output, no change of the command line or the random numbers."""
-    script = """
-        import random, sys
-        import numpy as np
-        before = random.getstate(), np.random.get_state()[1].tolist(), list(sys.argv)
-        import sb3_uav
-        assert (random.getstate(), np.random.get_state()[1].tolist(), list(sys.argv)) == before
-        heavy = {"torch", "rl_zoo3", "matplotlib", "stable_baselines3", "sb3_contrib", "pandas"} & set(sys.modules)
-        assert not heavy, heavy
-        import gymnasium as gym
-        assert "TaskAllocation-U4-N80-v0" in gym.registry
-        assert sb3_uav.__version__.count(".") >= 1
-    """
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", textwrap.dedent(script), "--algo", "unknown"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-# Environment checkers
-
-
-@pytest.mark.parametrize(
-    "env_id",
-    [
-        *SMALL_IDS,
-        "TaskAllocation-U4-N80-v0",
-        "TaskAllocation-U6-N80-v0",
-        "RoutePlanning-N80-v0",
-        "TaskAllocation-U6-N500-v0",
-        "RoutePlanning-N500-v0",
-        "TaskAllocation-U4-N1500-v0",
-        "RoutePlanning-N1500-v0",
-    ],
-)
-@pytest.mark.parametrize("wrapped", [True, False])
-def test_stable_baselines_env_checker(env_id: str, wrapped: bool) -> None:
-    """Without any warning, with and without Gymnasium's own wrappers."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gym.make(env_id, render_mode="rgb_array")
-        check_env(env if wrapped else env.unwrapped, skip_render_check="1500" in env_id)
-
-
-@pytest.mark.parametrize("env_id", SMALL_IDS)
-def test_gymnasium_env_checker(env_id: str) -> None:
-    """Without a warning but the one about unbounded Boxes: coordinates may lie anywhere."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=r".*(minimum|maximum) value is -?infinity")
-        gymnasium_check_env(gym.make(env_id).unwrapped)
 
 
 # Reset
@@ -396,9 +262,7 @@ def test_nothing_returned_shares_memory(level: str) -> None:
             action = act(env, rng)
             mask = env.action_masks()
             if vandal:
-                mask[:] = False
-                for array in observation.values():
-                    array[...] = 1
+                overwrite(mask, *observation.values())
             else:
                 kept = {key: value.copy() for key, value in observation.items()}
             new, reward, terminated, _, _ = env.step(action)
@@ -494,71 +358,3 @@ def test_set_router() -> None:
     env = TaskAllocationEnv(n_tasks=4, router=homebody)
     env.reset(seed=0)
     assert final_reward(env) == 0
-
-
-# Rendering
-
-
-@both_levels
-def test_rgb_array(level: str) -> None:
-    """A picture that changes from step to step and from episode to episode, the same for the same episode."""
-    env = make(level, n_tasks=5, max_distance=3.0, render_mode="rgb_array")
-
-    def images() -> list[np.ndarray]:
-        rng = np.random.default_rng(0)
-        env.reset(seed=0)
-        shown, terminated = [rendered(env)], False
-        while not terminated:
-            terminated = env.step(act(env, rng))[2]
-            shown.append(rendered(env))
-        return shown
-
-    first = images()
-    for image in first:
-        assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 and image.std() > 0
-        assert image.shape == first[0].shape
-    # The last step of a route only flies home, which the closed tour has shown already.
-    n_distinct = len({image.tobytes() for image in first})
-    assert n_distinct >= len(first) - 1
-    assert all(np.array_equal(a, b) for a, b in zip(first, images(), strict=True))
-    env.reset(seed=1)
-    assert not np.array_equal(rendered(env), first[0])
-    env.close()
-    env.close()
-
-
-@both_levels
-def test_human_mode_without_a_display(level: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Says once that nothing is shown, plays on, and leaves no figure behind."""
-    import matplotlib.pyplot as plt
-
-    env = make(level, n_tasks=4, render_mode="human")
-    with caplog.at_level(logging.WARNING):
-        play(env, np.random.default_rng(0), seed=0)
-        assert env.render() is None
-    env.close()
-    assert [record.message for record in caplog.records] == [
-        "No display was found, so render_mode='human' shows nothing; use render_mode='rgb_array'."
-    ]
-    assert plt.get_fignums() == []
-
-
-@both_levels
-def test_render_without_a_mode(level: str) -> None:
-    env = make(level)
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match=r"render\(\) does nothing without a render_mode; make the environment with"):
-        assert env.render() is None
-
-
-def test_drawing_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error names the command that installs it."""
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    env = RoutePlanningEnv(n_tasks=3, render_mode="rgb_array")
-    env.reset(seed=0)
-    with pytest.raises(ImportError, match=r"Drawing needs matplotlib; run: pip install 'sb3-uav\[plots\]'"):
-        env.render()
-
-
-def test_version() -> None:
-    assert sb3_uav.__version__ == (Path(sb3_uav.__file__).parent / "version.txt").read_text().strip()

@@ -24,7 +24,7 @@ from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.evaluation import results
 from sb3_uav.evaluation.parallel import Failure, Runner
-from sb3_uav.evaluation.results import RESULT_COLUMNS, instances_hash, locked_folder
+from sb3_uav.evaluation.results import RESULT_COLUMNS, locked_folder
 from sb3_uav.evaluation.run import evaluate, find_reference
 from sb3_uav.evaluation.summary import SummaryRow
 from sb3_uav.solvers import OneByOneSolver, Solution, Solver, SolverResult, make_solver
@@ -230,7 +230,7 @@ def test_what_was_evaluated_is_recorded(instances: Instances, tmp_path: Path) ->
     solver.files = {"router": tmp_path / "router"}
     evaluate([solver, Stub()], {"a": instances}, tmp_path / "out", seed=4, reference="stub")
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    assert told["instances"] == [{"name": "a", "n_instances": 5, "sha256": instances_hash(instances)}]
+    assert told["instances"] == [{"name": "a", "n_instances": 5, "sha256": instances.digest()}]
     assert told["solvers"]["K-means"] == {
         "spec": "kmeans-nearest:restarts=2,name=K-means",
         "settings": {"spec": "kmeans-nearest:restarts=2,name=K-means"},
@@ -243,9 +243,9 @@ def test_what_was_evaluated_is_recorded(instances: Instances, tmp_path: Path) ->
 
 
 def test_hash_of_instances(instances: Instances) -> None:
-    assert instances_hash(instances) == instances_hash(instances[:]) != instances_hash(instances[:4])
+    assert instances.digest() == instances[:].digest() != instances[:4].digest()
     moved = Instances.from_arrays(instances.depot + 1e-12, instances.tasks, task_mask=instances.task_mask, n_uavs=2)
-    assert instances_hash(moved) != instances_hash(instances)
+    assert moved.digest() != instances.digest()
 
 
 # --------------------------------------------------------------------------------------------- interruptions, and going on
@@ -351,7 +351,7 @@ def test_folders_that_hold_something_else(instances: Instances, tmp_path: Path) 
         assert "--overwrite" in str(error.value) and str(tmp_path) in str(error.value)
         return str(error.value)
 
-    short = instances_hash(instances)[:8]
+    short = instances.digest()[:8]
     assert f"other instances, a (5, {short}) where now comes a (4" in refusal({"a": instances[:4]})
     assert "other instances, a (5" in refusal({"b": instances[:1]})
     assert "other instances, b (1" in refusal({"a": instances, "c": instances})

@@ -13,7 +13,7 @@ from test_solvers import make_policy
 
 from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv, UniformGenerator, check_schedule, nearest_feasible, schedules
 from sb3_uav.envs.allocation import plan_tours
-from sb3_uav.envs.instances import MixtureGenerator
+from sb3_uav.envs.generators import MixtureGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback

@@ -158,7 +158,7 @@ def test_is_independent_of_the_dynamics() -> None:
             imported |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
             imported |= {alias.name for alias in node.names if alias.name.partition(".")[0] in ("sb3_uav", "torch", "numpy")}
-    assert imported == {"sb3_uav.envs.instances.Instances", "sb3_uav.envs.instances.DISTANCE_TOLERANCE"}
+    assert imported == {"sb3_uav.envs.instances.Instances", "sb3_uav.envs.distances.DISTANCE_TOLERANCE"}
     checker = ast.parse(inspect.getsource(check_schedule))
     attributes = [node for node in ast.walk(checker) if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
     used = {node.attr for node in attributes if isinstance(node.value, ast.Name) and node.value.id == "instances"}

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, TaskAllocationEnv, UniformGenerator
-from sb3_uav.envs.sweep import N_SYMMETRIES, reflect, sweep_order, turn
+from sb3_uav.envs.sweep import sweep_order
+from sb3_uav.envs.symmetries import N_SYMMETRIES, reflect, turn
 
 
 def angles(instances: Instances, row: int) -> list[float]:

@@ -1,10 +1,9 @@
-"""``BatchedVecEnv``, against SB3's ``DummyVecEnv`` and in SB3's hands."""
+"""``BatchedVecEnv``, against SB3's ``DummyVecEnv``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,99 +11,34 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import instance_batches, random_legal, seeds
+from env_helpers import (
+    LEVELS,
+    assert_same_arrays,
+    assert_same_run,
+    batched_env,
+    both_levels,
+    env_fns,
+    legal_actions,
+    overwrite,
+    reset,
+    step,
+)
 from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformReward
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor, load_results
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_uav.envs import (
     BatchedVecEnv,
     FixedGenerator,
     Instances,
     RoutePlanningEnv,
-    TaskAllocationEnv,
     UniformGenerator,
     nearest_feasible,
 )
-from sb3_uav.envs.gym_env import ProblemEnv
-
-LEVELS: dict[str, Callable[..., ProblemEnv]] = {"routing": RoutePlanningEnv, "allocation": TaskAllocationEnv}
-both_levels = pytest.mark.parametrize("level", sorted(LEVELS))
-
-
-def env_fns(level: str, n_envs: int, **kwargs: Any) -> list[Callable[[], gym.Env]]:
-    return [lambda: Monitor(LEVELS[level](**kwargs)) for _ in range(n_envs)]
-
-
-def batched_env(level: str, n_envs: int, **kwargs: Any) -> BatchedVecEnv:
-    return BatchedVecEnv(env_fns(level, n_envs, **kwargs))
-
-
-def reset(env: VecEnv) -> dict[str, np.ndarray]:
-    observation = env.reset()
-    assert isinstance(observation, dict)
-    return observation
-
-
-def step(env: VecEnv, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
-    observation, rewards, dones, infos = env.step(actions)
-    assert isinstance(observation, dict)
-    return observation, rewards, dones, infos
-
-
-def masks_of(env: VecEnv) -> np.ndarray:
-    return np.stack(env.env_method("action_masks"))
-
-
-def legal_actions(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
-    return random_legal(th.from_numpy(masks_of(env)), rng).numpy()
-
-
-def assert_same_arrays(a: Any, b: Any) -> None:
-    """Two Dict observations, keys in the same order, dtypes and values."""
-    assert list(a) == list(b)
-    for key in a:
-        assert a[key].dtype == b[key].dtype and np.array_equal(a[key], b[key]), key
-
-
-def assert_same_infos(a: dict[str, Any], b: dict[str, Any]) -> None:
-    """Everything but the clock."""
-    assert set(a) - {"TimeLimit.truncated"} == set(b) - {"TimeLimit.truncated"}
-    assert a.get("TimeLimit.truncated", False) == b.get("TimeLimit.truncated", False)
-    assert a["illegal_actions"] == b["illegal_actions"]
-    assert a.get("objective") == b.get("objective")
-    if "episode" in a:
-        assert {**a["episode"], "t": 0} == {**b["episode"], "t": 0} and a["episode"]["t"] >= 0
-        assert_same_arrays(a["terminal_observation"], b["terminal_observation"])
-
-
-def assert_same_run(ours: VecEnv, theirs: VecEnv, rng: np.random.Generator, n_steps: int, recklessness: float) -> int:
-    """
-    Step both alike and compare everything they return.
-
-    :return: How many episodes ended
-    """
-    n_episodes = 0
-    for _ in range(n_steps):
-        assert np.array_equal(masks_of(ours), masks_of(theirs))
-        actions = legal_actions(theirs, rng)
-        careless = rng.random(len(actions)) < recklessness
-        actions[careless] = rng.integers(0, masks_of(ours).shape[1], careless.sum())
-        (obs_a, rewards_a, dones_a, infos_a), (obs_b, rewards_b, dones_b, infos_b) = step(ours, actions), step(theirs, actions)
-        assert_same_arrays(obs_a, obs_b)
-        for a, b in ((rewards_a, rewards_b), (dones_a, dones_b)):
-            assert a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b)
-        for info_a, info_b, done in zip(infos_a, infos_b, dones_a, strict=True):
-            assert_same_infos(info_a, info_b)
-            assert ("episode" in info_a) == done
-        n_episodes += dones_a.sum()
-    return int(n_episodes)
-
 
 # The same as DummyVecEnv
 
@@ -230,9 +164,7 @@ def test_nothing_returned_shares_memory(level: str) -> None:
             actions = legal_actions(env, rng)
             masks = env.action_masks()
             if vandal:
-                masks[:] = False
-                for array in observation.values():
-                    array[...] = 1
+                overwrite(masks, *observation.values())
             before = {key: array.copy() for key, array in observation.items()}
             new, rewards, dones, infos = step(env, actions)
             assert_same_arrays(observation, before)
@@ -436,170 +368,3 @@ def test_env_is_wrapped() -> None:
     env = batched_env("routing", 3)
     assert env.env_is_wrapped(Monitor) == [True] * 3 and env.env_is_wrapped(Monitor, indices=[1]) == [True]
     assert env.env_is_wrapped(TransformReward) == [False] * 3 and env.env_is_wrapped(OtherMonitor) == [False] * 3
-
-
-# In SB3's hands
-
-
-def run_random(env: VecEnv, n_steps: int) -> list[list[dict[str, float]]]:
-    """The episode infos of each row."""
-    rng = np.random.default_rng(0)
-    episodes: list[list[dict[str, float]]] = [[] for _ in range(env.num_envs)]
-    reset(env)
-    for _ in range(n_steps):
-        infos = env.step(legal_actions(env, rng))[3]
-        for row, info in enumerate(infos):
-            if "episode" in info:
-                episodes[row].append(info["episode"])
-    return episodes
-
-
-@pytest.mark.parametrize("env_id", ["RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"])
-def test_monitor_file_holds_the_episodes_of_row_0(env_id: str, tmp_path: Path) -> None:
-    env = make_vec_env(
-        env_id,
-        n_envs=3,
-        seed=0,
-        monitor_dir=str(tmp_path),
-        vec_env_cls=BatchedVecEnv,  # type: ignore[arg-type]
-        monitor_kwargs={"info_keywords": ("objective", "illegal_actions")},
-    )
-    episodes = run_random(env, 70)
-    env.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["0.monitor.csv"]
-    results = load_results(str(tmp_path))
-    assert len(episodes[0]) >= 3 and len(results) == len(episodes[0])
-    for column in ("r", "l", "objective", "illegal_actions"):
-        assert results[column].tolist() == pytest.approx([episode[column] for episode in episodes[0]])
-    assert results["t"].is_monotonic_increasing
-
-
-@both_levels
-def test_vec_monitor(level: str, tmp_path: Path) -> None:
-    """Counts the same returns and lengths as the environment itself."""
-    inner = batched_env(level, 3, n_tasks=4)
-    inner.seed(0)
-    own = run_random(inner, 20)
-    inner.seed(0)
-    with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
-        env = VecMonitor(inner, str(tmp_path / "all"))
-    outer = run_random(env, 20)
-    env.close()
-    for row in range(3):
-        assert [e["l"] for e in own[row]] == [e["l"] for e in outer[row]]
-        assert [e["r"] for e in own[row]] == pytest.approx([e["r"] for e in outer[row]])
-    assert len(load_results(str(tmp_path))) == sum(len(row) for row in own)
-
-
-@both_levels
-def test_vec_normalize(level: str) -> None:
-    """Rewards normalized, observations left alone, and the originals at hand."""
-    plain, inner = batched_env(level, 3, n_tasks=4), batched_env(level, 3, n_tasks=4)
-    env = VecNormalize(inner, norm_obs=False)
-    plain.seed(0)
-    env.seed(0)
-    assert_same_arrays(reset(env), reset(plain))
-    rng = np.random.default_rng(0)
-    for _ in range(12):
-        actions = legal_actions(plain, rng)
-        expected, rewards, dones, _ = plain.step(actions)
-        observation, normalized, their_dones, _ = env.step(actions)
-        assert_same_arrays(observation, expected)
-        assert np.array_equal(env.get_original_reward(), rewards) and np.array_equal(dones, their_dones)
-        assert (np.sign(normalized) == np.sign(rewards)).all()
-    assert np.isfinite(normalized).all() and env.ret_rms.var > 0
-
-
-class RandomPolicy:
-    """Any legal action, as observed."""
-
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(0)
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, None]:
-        return random_legal(th.from_numpy(observation["action_mask"].astype(bool)), self.rng).numpy(), None
-
-
-@both_levels
-def test_evaluate_policy(level: str) -> None:
-    """SB3's evaluation gives the same episodes on our VecEnv and on SB3's, and no illegal action."""
-    fns = env_fns(level, 2, n_tasks=5)
-    results, illegal = [], []
-
-    def look(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
-        illegal.append(local_variables["info"]["illegal_actions"])
-
-    for env in (BatchedVecEnv(fns), DummyVecEnv(fns)):
-        env.seed(3)
-        rewards, lengths = evaluate_policy(RandomPolicy(), env, 7, return_episode_rewards=True, callback=look)
-        assert isinstance(rewards, list) and isinstance(lengths, list)
-        results.append((rewards, lengths))
-        assert len(rewards) == 7 and 0 <= min(rewards) <= max(rewards) <= 5 and 1 <= min(lengths) <= max(lengths) <= 6
-    assert results[0] == results[1]
-    assert len(illegal) > 0 and set(illegal) == {0}
-
-
-@both_levels
-def test_stock_ppo_learns_the_same(level: str) -> None:
-    """SB3's PPO with SB3's policy: a few updates on our VecEnv and on SB3's end with equal parameters."""
-    models = []
-    for vec_env_cls in (BatchedVecEnv, DummyVecEnv):
-        env = vec_env_cls(env_fns(level, 4, n_tasks=5))
-        model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=16, n_epochs=1, seed=0, policy_kwargs={"net_arch": [8]})
-        before = {name: parameter.clone() for name, parameter in model.policy.state_dict().items()}
-        model.learn(64)
-        assert model.num_timesteps == 64 and len(model.ep_info_buffer) > 0  # type: ignore[arg-type]
-        assert any(not th.equal(before[name], parameter) for name, parameter in model.policy.state_dict().items())
-        models.append(model)
-    ours, theirs = (model.policy.state_dict() for model in models)
-    assert all(th.equal(ours[name], theirs[name]) for name in ours)
-
-
-# Rendering
-
-
-@both_levels
-def test_images(level: str) -> None:
-    """One per row, as the single environment draws it; tiled by ``render``."""
-    fns = env_fns(level, 2, n_tasks=4, render_mode="rgb_array")
-    ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
-    assert ours.metadata == {"render_modes": ["human", "rgb_array"]}
-    for env in (ours, theirs):
-        env.seed(0)
-        reset(env)
-    actions = legal_actions(ours, np.random.default_rng(0))
-    for env in (ours, theirs):
-        env.step(actions)
-    images = ours.get_images()
-    assert len(images) == 2 and not np.array_equal(images[0], images[1])  # type: ignore[arg-type]
-    for image, expected in zip(images, theirs.get_images(), strict=True):
-        assert image is not None and image.dtype == np.uint8 and np.array_equal(image, expected)  # type: ignore[arg-type]
-    big = ours.render()
-    assert big is not None and np.array_equal(big, theirs.render())  # type: ignore[arg-type]
-    (second,) = ours.env_method("render", indices=1)
-    assert np.array_equal(second, images[1])  # type: ignore[arg-type]
-    ours.close()
-
-
-@both_levels
-def test_no_images_without_a_render_mode(level: str) -> None:
-    env = batched_env(level, 2, n_tasks=4)
-    reset(env)
-    assert list(env.get_images()) == [None, None]
-    with pytest.warns(UserWarning, match="no `render_mode` was passed"):
-        assert env.render() is None
-
-
-def test_human_mode_without_a_display() -> None:
-    """Does not crash, and leaves no figure behind."""
-    import matplotlib.pyplot as plt
-
-    env = batched_env("routing", 2, n_tasks=4, render_mode="human")
-    reset(env)
-    assert env.render() is None
-    env.step(legal_actions(env, np.random.default_rng(0)))
-    assert env.render() is None
-    env.close()
-    assert plt.get_fignums() == []

@@ -1,12 +1,6 @@
 from sb3_uav.envs.allocation import AllocationProblem, TaskAllocationEnv, plan_tours, schedules, split_tasks
-from sb3_uav.envs.instances import (
-    ClusteredGenerator,
-    FixedGenerator,
-    InstanceGenerator,
-    Instances,
-    MixtureGenerator,
-    UniformGenerator,
-)
+from sb3_uav.envs.generators import ClusteredGenerator, FixedGenerator, InstanceGenerator, MixtureGenerator, UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv, Router, RoutingProblem, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, ScheduleReport, check_schedule
 from sb3_uav.envs.vec_env import BatchedVecEnv

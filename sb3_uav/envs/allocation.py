@@ -9,8 +9,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.envs.instances import InstanceGenerator, Instances, make_generator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem
 from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import Schedule

@@ -7,8 +7,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Episodes, Problem, given_instance
+from sb3_uav.envs.problem import Problem
 
 
 class ProblemEnv(gym.Env[Any, Any]):
@@ -46,7 +47,7 @@ class ProblemEnv(gym.Env[Any, Any]):
 
         :raises ValueError: If its instances do not fit the observation space
         """
-        set_generator(self.problem, generator)
+        self.problem.set_generator(generator)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -102,20 +103,3 @@ class ProblemEnv(gym.Env[Any, Any]):
         if self._figure is not None:
             self._figure.close()
             self._figure = None
-
-
-def set_generator(problem: Problem, generator: Any) -> None:
-    """
-    Replace the generator of a problem by one of the same size.
-
-    :param problem: The problem
-    :param generator: An ``InstanceGenerator``
-    :raises ValueError: If its instances do not fit the observation space
-    """
-    old, new = problem.generator, generator
-    if (new.n_tasks, new.n_uavs) != (old.n_tasks, old.n_uavs):
-        raise ValueError(
-            f"The new generator draws {new.n_tasks} tasks and {new.n_uavs} UAVs, the environment was made for "
-            f"{old.n_tasks} and {old.n_uavs}; make a new environment."
-        )
-    problem.generator = generator

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances
+from sb3_uav.envs.distances import DISTANCE_TOLERANCE
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 
 # Solvers leave this part of the tolerance of the dynamics and of the checker to the rounding of sums of distances: far more

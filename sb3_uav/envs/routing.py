@@ -9,8 +9,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_uav.envs.distances import distance_limit, euclidean
+from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.envs.instances import InstanceGenerator, Instances, distance_limit, euclidean, make_generator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem
 
 DEPOT = 0
@@ -54,6 +56,13 @@ class RoutingDynamics(Dynamics):
         self.limit = distance_limit(instances.max_distance)
         self._rows = th.arange(len(instances), device=instances.device)[:, None]
 
+    def points(self, nodes: th.Tensor) -> th.Tensor:
+        """
+        :param nodes: ``(batch, n_samples)`` int64, nodes of each instance
+        :return: ``(batch, n_samples, 2)`` float64, their coordinates
+        """
+        return self.nodes[self._rows, nodes]
+
     def reset(self, n_samples: int = 1) -> RoutingState:
         shape = (len(self.instances), n_samples)
         device = self.instances.device
@@ -64,7 +73,7 @@ class RoutingDynamics(Dynamics):
         return RoutingState(position, visited, travelled, done, self._action_mask(position, visited, travelled, done))
 
     def _action_mask(self, position: th.Tensor, visited: th.Tensor, travelled: th.Tensor, done: th.Tensor) -> th.Tensor:
-        here = self.nodes[self._rows, position]
+        here = self.points(position)
         detour = euclidean(self.nodes[:, None, 1:], here[:, :, None]) + self.home[:, None, 1:]
         feasible = ~visited & (travelled[..., None] + detour <= self.limit[:, None, None]) & ~done[..., None]
         return th.cat([~feasible.any(-1, keepdim=True), feasible], dim=-1)
@@ -73,7 +82,7 @@ class RoutingDynamics(Dynamics):
         legal = state.action_mask.gather(-1, actions[..., None]).squeeze(-1)
         node = th.where(legal, actions, DEPOT)
         goes_home = (node == DEPOT) & ~state.done
-        here, there = self.nodes[self._rows, state.position], self.nodes[self._rows, node]
+        here, there = self.points(state.position), self.points(node)
         # A finished UAV stands in the depot and goes nowhere: its leg has length 0.
         travelled = state.travelled + euclidean(there, here)
         # A padded first column takes the visits of the depot.
@@ -96,7 +105,7 @@ def nearest_feasible(instances: Instances) -> th.Tensor:
     state = dynamics.reset()
     tours = []
     while not state.done.all():
-        here = dynamics.nodes[dynamics._rows, state.position]
+        here = dynamics.points(state.position)
         distance = euclidean(dynamics.nodes[:, None], here[:, :, None])
         action = distance.masked_fill(~state.action_mask, th.inf).argmin(-1)
         tours.append(action)

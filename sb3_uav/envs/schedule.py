@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances
+from sb3_uav.envs.distances import DISTANCE_TOLERANCE
+from sb3_uav.envs.instances import Instances
 
 
 class InfeasibleScheduleError(ValueError):

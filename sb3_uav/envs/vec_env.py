@@ -13,8 +13,9 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_uav.envs.gym_env import ProblemEnv, set_generator
-from sb3_uav.envs.problem import Episodes, Problem, given_instance
+from sb3_uav.envs.episodes import Episodes, given_instance
+from sb3_uav.envs.gym_env import ProblemEnv
+from sb3_uav.envs.problem import Problem
 
 # Wrappers that change nothing: episode statistics are kept below.
 TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker)
@@ -131,7 +132,7 @@ class BatchedVecEnv(VecEnv):
 
     def set_generator(self, generator: Any) -> None:
         """Draw the instances of the next episodes from another source of the same size."""
-        set_generator(self.problem, generator)
+        self.problem.set_generator(generator)
 
     def close(self) -> None:
         if self._monitor is not None:

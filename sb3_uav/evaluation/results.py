@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import math
 import os
@@ -105,17 +104,6 @@ def one_line(text: object) -> str:
     :return: It, without line breaks
     """
     return " ".join(str(text).split())
-
-
-def instances_hash(instances: Instances) -> str:
-    """
-    :param instances: Instances on the CPU
-    :return: SHA-256 of all that they hold
-    """
-    digest = hashlib.sha256(f"{instances.n_uavs} {tuple(instances.task_mask.shape)}\n".encode())
-    for name in ("depot", "tasks", "values", "max_distance", "task_mask"):
-        digest.update(getattr(instances, name).contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def describe_solver(solver: Solver) -> dict[str, Any]:
@@ -289,7 +277,7 @@ class EvaluationFolder:
         settings: dict[str, Any] = {
             "format": FORMAT,
             "instances": [
-                {"name": name, "n_instances": len(batch), "sha256": instances_hash(batch)} for name, batch in sources.items()
+                {"name": name, "n_instances": len(batch), "sha256": batch.digest()} for name, batch in sources.items()
             ],
             "solvers": {solver.name: describe_solver(solver) for solver in solvers},
             "runs": [{**run, **describe_machine()}],

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sb3_uav.envs.instances import DISTANCE_TOLERANCE, Instances, UniformGenerator
+from sb3_uav.envs.distances import DISTANCE_TOLERANCE
+from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.reduction import USABLE_TOLERANCE
 from sb3_uav.envs.schedule import Schedule, ScheduleReport, check_schedule
 from sb3_uav.local_search import kernels

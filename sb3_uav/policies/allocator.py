@@ -13,7 +13,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
 from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem
-from sb3_uav.envs.instances import Instances, UniformGenerator
+from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.sweep import sweep_order
 from sb3_uav.policies.base import PRESETS, Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import StaticObservation

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch as th
 from torch.nn import functional
 
-from sb3_uav.envs.instances import euclidean
+from sb3_uav.envs.distances import euclidean
 
 if TYPE_CHECKING:
     from sb3_uav.policies.encoder import StaticObservation

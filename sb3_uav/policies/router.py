@@ -11,7 +11,8 @@ from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from sb3_uav.envs.instances import Instances, UniformGenerator
+from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value
 from sb3_uav.policies.base import Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
 from sb3_uav.policies.encoder import StaticObservation, attend

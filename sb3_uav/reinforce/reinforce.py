@@ -27,7 +27,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.envs.instances import Instances, training_batch
+from sb3_uav.envs.generators import training_batch
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy

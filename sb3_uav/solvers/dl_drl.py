@@ -15,7 +15,7 @@ from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.envs.sweep import N_SYMMETRIES, reflect
+from sb3_uav.envs.symmetries import N_SYMMETRIES, reflect
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained import pair_files

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import os
 import time
@@ -17,9 +16,10 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.npz import read_npz
 from sb3_uav.common.random_streams import FIXED_SET_ACTION_STREAM, FIXED_SET_STREAM, random_stream
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.envs.instances import UNREADABLE, Instances
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
@@ -126,11 +126,7 @@ class EvaluationHistory(NamedTuple):
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; give the {RESULTS_FILE} that FixedSetEvalCallback wrote.")
-        try:
-            with path.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except UNREADABLE as error:
-            raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); delete it and evaluate anew.") from error
+        arrays = read_npz(path, "delete it and evaluate anew")
         missing = set(cls._fields) - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; it was not written by FixedSetEvalCallback.")
@@ -505,7 +501,4 @@ def fingerprint(instances: Instances, n_samples: int) -> str:
     :param n_samples: Samples per instance
     :return: A name for the evaluation on these
     """
-    digest = hashlib.sha256(repr((instances.tasks.shape, instances.n_uavs, n_samples)).encode())
-    for name in ("depot", "tasks", "values", "max_distance", "task_mask"):
-        digest.update(getattr(instances, name).cpu().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    return instances.digest(repr((instances.tasks.shape, instances.n_uavs, n_samples)))[:16]

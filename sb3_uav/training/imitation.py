@@ -12,9 +12,10 @@ import torch as th
 from torch.nn import functional
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.instances import InstanceGenerator, Instances, training_batch
+from sb3_uav.envs.generators import InstanceGenerator, training_batch
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.envs.sweep import turn
+from sb3_uav.envs.symmetries import turn
 from sb3_uav.local_search.search import LocalSearch
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.training.imitation_progress import ImitationProgress, Lesson

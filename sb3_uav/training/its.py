@@ -29,7 +29,7 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.allocation import AllocationProblem
-from sb3_uav.envs.instances import training_batch
+from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy

@@ -17,7 +17,8 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import GRID_SEED
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.allocation import AllocationProblem, plan_tours
-from sb3_uav.envs.instances import Instances, UniformGenerator
+from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce.reinforce import find_problem
 from sb3_uav.training.common import siblings

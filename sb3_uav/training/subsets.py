@@ -10,7 +10,8 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.instances import InstanceGenerator, Instances, MixtureGenerator, training_batch
+from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, training_batch
+from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import AllocatorPolicy
 
 # How many instances of a test are allocated at once: the smaller of the paper's batches.

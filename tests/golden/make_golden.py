@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from greedy_episodes import greedy_episode
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 
@@ -29,18 +30,6 @@ NETWORK = dict(preset="paper", embed_dim=8, n_layers=1, n_heads=2, ff_dim=8, nor
 
 def make_env(level: str) -> Any:
     return TaskAllocationEnv(6, 2) if level == "allocator" else RoutePlanningEnv(6)
-
-
-def greedy_episode(model: Any, level: str) -> list[int]:
-    """:return: The actions of the greedy episode on the instance of seed 0"""
-    env = make_env(level)
-    observation, _ = env.reset(seed=0)
-    actions, done = [], False
-    while not done:
-        action, _ = model.predict(observation, deterministic=True)
-        observation, _, done, _, _ = env.step(int(action))
-        actions.append(int(action))
-    return actions
 
 
 def repack(path: Path) -> None:
@@ -64,7 +53,7 @@ def main() -> None:
             model.learn(480)
             model.save(FOLDER / f"{name}-{level}")
             repack(FOLDER / f"{name}-{level}.zip")
-            expected[f"{name}-{level}"] = greedy_episode(model, level)
+            expected[f"{name}-{level}"] = greedy_episode(model, level)[0]
     (FOLDER / "actions.json").write_text(json.dumps(expected, indent=1) + "\n", encoding="utf-8")
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.instances import InstanceGenerator, Instances
+from sb3_uav.envs.generators import InstanceGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE

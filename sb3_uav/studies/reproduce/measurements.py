@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_uav.common.random_streams import TEST_SEED
-from sb3_uav.envs.instances import Instances, UniformGenerator
+from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.run import Progress, UnavailableSolver, evaluate
 from sb3_uav.evaluation.summary import SummaryRow
 from sb3_uav.solvers.base import Solver, make_solver

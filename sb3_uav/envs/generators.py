@@ -1,0 +1,221 @@
+"""Sources of instances: distributions, mixtures of sizes, and rows of given instances."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch as th
+
+from sb3_uav.envs.instances import Instances
+
+
+class InstanceGenerator(Protocol):
+    """Draws instances of one size. Stateless: the same ``rng`` state gives the same instances."""
+
+    @property
+    def n_tasks(self) -> int: ...
+
+    @property
+    def n_uavs(self) -> int: ...
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        :param batch_size: Number of instances
+        :param rng: The source of randomness
+        :return: ``batch_size`` instances of ``n_tasks`` task slots, float64 on the CPU
+        """
+        ...
+
+
+def check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
+    """
+    :raises ValueError: If a size is not allowed; the message names it
+    """
+    if n_tasks < 1:
+        raise ValueError(f"n_tasks is {n_tasks}, but an instance needs at least 1 task.")
+    if n_uavs < 1:
+        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV.")
+    if not (np.isfinite(max_distance) and max_distance > 0):
+        raise ValueError(f"max_distance is {max_distance}, but the maximum flight distance must be a finite number > 0.")
+
+
+def _with_unit_values(depot: np.ndarray, tasks: np.ndarray, max_distance: float, n_uavs: int) -> Instances:
+    batch_size, n_tasks = tasks.shape[:2]
+    return Instances(
+        depot=th.from_numpy(depot),
+        tasks=th.from_numpy(tasks),
+        values=th.ones(batch_size, n_tasks, dtype=th.float64),
+        max_distance=th.full((batch_size,), max_distance, dtype=th.float64),
+        n_uavs=n_uavs,
+        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool),
+    )
+
+
+@dataclass(frozen=True)
+class UniformGenerator:
+    """
+    Depot and tasks uniform in the unit square, all values 1: the paper's distribution (section V-A).
+
+    :param n_tasks: Number of tasks (the paper's N)
+    :param n_uavs: Number of UAVs (the paper's V)
+    :param max_distance: Maximum flight distance (the paper's D = 2.0)
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 4
+    max_distance: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        points = rng.random((batch_size, self.n_tasks + 1, 2))
+        return _with_unit_values(points[:, 0].copy(), points[:, 1:].copy(), self.max_distance, self.n_uavs)
+
+
+@dataclass(frozen=True)
+class ClusteredGenerator:
+    """
+    Tasks normally distributed around uniform centres, clipped to the unit square; the depot is uniform.
+
+    :param n_tasks: Number of tasks
+    :param n_uavs: Number of UAVs
+    :param max_distance: Maximum flight distance
+    :param n_clusters: Number of centres
+    :param spread: Standard deviation around a centre
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 4
+    max_distance: float = 2.0
+    n_clusters: int = 5
+    spread: float = 0.07
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        if self.n_clusters < 1 or not self.spread >= 0:
+            raise ValueError(f"n_clusters must be >= 1 and spread >= 0, found {self.n_clusters} and {self.spread}.")
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        depot = rng.random((batch_size, 2))
+        centres = rng.random((batch_size, self.n_clusters, 2))
+        cluster = rng.integers(self.n_clusters, size=(batch_size, self.n_tasks))
+        noise = rng.normal(0.0, self.spread, (batch_size, self.n_tasks, 2))
+        tasks = np.clip(np.take_along_axis(centres, cluster[..., None], axis=1) + noise, 0.0, 1.0)
+        return _with_unit_values(depot, tasks, self.max_distance, self.n_uavs)
+
+
+# With fewer tasks than these nearly any allocation visits all of them, and there is little to learn.
+TASKS_PER_UAV = 12
+# Small instances teach nearly as much as large ones and cost less, so there are more of them; 1 is uniform in the logarithm.
+SMALL_SIZES = 1.5
+# Not 1, as equally many tasks in all would need: large batches of small tensors waste less time on launching operations.
+FEWER_INSTANCES = 0.85
+
+
+@dataclass(frozen=True)
+class MixtureGenerator:
+    """
+    Training batches of one random size each: a number of tasks, a fleet of at least 2 UAVs and a maximum flight distance, so
+    that one network learns them all. Depot and tasks are uniform in the unit square.
+
+    Called like any other generator, it gives instances of the largest size.
+
+    :param n_tasks: Largest number of tasks
+    :param n_uavs: Largest fleet
+    :param max_distance: Maximum flight distance of every second batch; of the others 0.6 to 1.6 times as much
+    :param min_tasks: Smallest number of tasks
+    :raises ValueError: If a size is not allowed
+    """
+
+    n_tasks: int
+    n_uavs: int = 8
+    max_distance: float = 2.0
+    min_tasks: int = 40
+
+    def __post_init__(self) -> None:
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        if self.min_tasks < 1:
+            raise ValueError(f"min_tasks is {self.min_tasks}; give at least 1.")
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return UniformGenerator(self.n_tasks, self.n_uavs, self.max_distance)(batch_size, rng)
+
+    def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        """
+        :param batch_size: Number of instances of the smallest size; of larger ones there are fewer
+        :param rng: The source of randomness
+        :return: Instances of a random size
+        """
+        n_uavs = int(rng.integers(min(2, self.n_uavs), self.n_uavs, endpoint=True))
+        least = min(self.min_tasks, self.n_tasks)
+        fewest = min(max(least, TASKS_PER_UAV * n_uavs), self.n_tasks)
+        n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** SMALL_SIZES))
+        factor = 1.0 if rng.random() < 0.5 else rng.uniform(0.6, 1.6)
+        n_instances = max(round(batch_size * (least / n_tasks) ** FEWER_INSTANCES), 2)
+        return UniformGenerator(n_tasks, n_uavs, self.max_distance * factor)(n_instances, rng)
+
+
+def training_batch(generator: InstanceGenerator, batch_size: int, rng: np.random.Generator) -> Instances:
+    """
+    The instances of one update: what the generator gives, or what it prefers to train on.
+
+    :param generator: Any generator
+    :param batch_size: Number of instances; a generator of mixed sizes may give another one
+    :param rng: The source of randomness
+    """
+    return getattr(generator, "training_batch", generator)(batch_size, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedGenerator:
+    """
+    Rows of given instances, drawn at random with replacement.
+
+    :param instances: The instances to draw from
+    """
+
+    instances: Instances
+
+    @property
+    def n_tasks(self) -> int:
+        return self.instances.n_tasks
+
+    @property
+    def n_uavs(self) -> int:
+        return self.instances.n_uavs
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return self.instances[rng.integers(len(self.instances), size=batch_size)]
+
+
+GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator, "mixture": MixtureGenerator}
+
+
+def make_generator(
+    n_tasks: int,
+    n_uavs: int,
+    max_distance: float = 2.0,
+    distribution: str = "uniform",
+    instances: str | os.PathLike[str] | Instances | None = None,
+) -> InstanceGenerator:
+    """
+    The generator that plain-data arguments of an environment describe.
+
+    :param n_tasks: Number of tasks; ignored when ``instances`` is given
+    :param n_uavs: Number of UAVs; ignored when ``instances`` is given
+    :param max_distance: Maximum flight distance; ignored when ``instances`` is given
+    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
+    :param instances: Instances, or the path of an ``.npz`` file, to draw from instead of a distribution
+    :raises ValueError: If an argument is not allowed
+    """
+    if instances is not None:
+        return FixedGenerator(instances if isinstance(instances, Instances) else Instances.load(instances))
+    if distribution not in GENERATORS:
+        raise ValueError(f"distribution is {distribution!r}; choose one of {sorted(GENERATORS)}.")
+    return GENERATORS[distribution](n_tasks=n_tasks, n_uavs=n_uavs, max_distance=max_distance)

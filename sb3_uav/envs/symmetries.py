@@ -1,0 +1,42 @@
+"""Instances turned and mirrored around their depots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch as th
+
+from sb3_uav.envs.instances import Instances
+
+N_SYMMETRIES = 8
+
+
+def reflect(instances: Instances, symmetry: int) -> Instances:
+    """
+    Turn and mirror the tasks around the depot; all distances stay as they are.
+
+    :param instances: ``batch`` instances
+    :param symmetry: Which of the :data:`N_SYMMETRIES` symmetries of the square; 0 changes nothing
+    :return: The instances seen in that way
+    """
+    if symmetry == 0:
+        return instances
+    offset = instances.tasks - instances.depot[:, None]
+    if symmetry & 1:
+        offset = offset.flip(-1)
+    signs = offset.new_tensor([-1.0 if symmetry & 2 else 1.0, -1.0 if symmetry & 4 else 1.0])
+    return replace(instances, tasks=instances.depot[:, None] + offset * signs)
+
+
+def turn(instances: Instances, angle: th.Tensor) -> Instances:
+    """
+    Turn the tasks around the depot; all distances stay as they are, but for rounding errors.
+
+    :param instances: ``batch`` instances
+    :param angle: ``(batch,)``, in radians
+    :return: The turned instances
+    """
+    x, y = (instances.tasks - instances.depot[:, None]).unbind(-1)
+    cosine, sine = (part.to(x.dtype)[:, None] for part in (angle.cos(), angle.sin()))
+    turned = th.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
+    return replace(instances, tasks=instances.depot[:, None] + turned)
