@@ -82,7 +82,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     from sb3_uav.policies.loading import load_policy
     from sb3_uav.solvers.base import Solver, make_solver
     from sb3_uav.solvers.dl_drl import DLDRL
-    from sb3_uav.training.its import LOG_FILE
+    from sb3_uav.training.epoch_log import LOG_FILE
 
     environment = gym.make(env_id).unwrapped
     assert isinstance(environment, TaskAllocationEnv)

@@ -31,7 +31,7 @@ from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
-from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}

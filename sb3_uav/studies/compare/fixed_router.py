@@ -15,6 +15,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.subsets import SingleUavGenerator
 
 # What a YAML entry of ITSCallback's router overrides.
 RECIPE: dict[str, Any] = dict(
@@ -28,19 +29,13 @@ RECIPE: dict[str, Any] = dict(
 )
 
 
-class DividedSubsets:
+class DividedSubsets(SingleUavGenerator):
     """
     Single-UAV subsets of instances that are divided without an allocator: half of them at random, as an untrained one does,
     half into sectors around the depot, much as a trained one does.
 
     :param generator: Draws the instances of the fleet
     """
-
-    n_uavs = 1
-
-    def __init__(self, generator: InstanceGenerator) -> None:
-        self.generator = generator
-        self.n_tasks = generator.n_tasks
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
