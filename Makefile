@@ -2,10 +2,13 @@
 # the tests.
 PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python3)
 PYTEST_ARGS ?=
+# Versions to install; empty for the newest that setup.cfg allows.
+CONSTRAINTS ?= constraints.txt
 
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+PIP_CONSTRAINTS := $(addprefix -c ,$(CONSTRAINTS))
 LINT_PATHS := sb3_uav tests benchmarks examples scripts
 # Some are about results, not speed: they take arguments and an hour.
 NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py)
@@ -18,10 +21,10 @@ BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard ben
 install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
 
 # torch comes first and alone: without its pin pip may fetch several gigabytes of another build.
-$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+$(INSTALLED): setup.cfg pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -c constraints.txt torch
-	$(BIN)/python -m pip install -c constraints.txt -e ".[all,dev]"
+	$(BIN)/python -m pip install $(PIP_CONSTRAINTS) torch
+	$(BIN)/python -m pip install $(PIP_CONSTRAINTS) -e ".[all,dev]"
 	touch $@
 
 demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)

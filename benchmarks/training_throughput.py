@@ -160,11 +160,12 @@ def router_shape(name: str) -> dict[str, Any]:
     :param name: ``"default"`` or ``"paper"``
     :return: Layers, width, heads and normalization of that router
     """
-    from sb3_uav.policies.base import PRESETS
+    from sb3_uav.policies.settings import NetworkSettings
 
-    policy_kwargs = {"preset": "default", **settings_of(name)["router"]["policy_kwargs"]}
-    network = {**PRESETS[policy_kwargs["preset"]], **policy_kwargs}
-    return {key: network[key] for key in SHAPE}
+    policy_kwargs = dict(settings_of(name)["router"]["policy_kwargs"])
+    preset = policy_kwargs.pop("preset", "default")
+    network = NetworkSettings.of(policy_kwargs, preset)
+    return {key: getattr(network, key) for key in SHAPE}
 
 
 def padded_plan(router: RouterPolicy) -> Router:

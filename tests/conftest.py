@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 # Before anything imports matplotlib: tests never open a window.
 os.environ["MPLBACKEND"] = "Agg"
@@ -16,6 +17,10 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
 from sb3_uav.envs.problem import Dynamics
+
+if TYPE_CHECKING:
+    from classical_helpers import Ticks
+    from evaluate_cli_helpers import Inputs
 
 # Repeatable on CI; `--hypothesis-profile=explore` searches on.
 settings.register_profile("repeatable", deadline=None, derandomize=True, print_blob=True)
@@ -45,6 +50,34 @@ def rng() -> np.random.Generator:
 def small() -> Instances:
     """Three instances of 5 tasks and 2 UAVs."""
     return UniformGenerator(n_tasks=5, n_uavs=2)(3, np.random.default_rng(1))
+
+
+@pytest.fixture
+def instances() -> Instances:
+    """Five instances of 6 tasks and 2 UAVs, in rows of 8; modules that need others override it."""
+    return UniformGenerator(6, n_uavs=2)(5, np.random.default_rng(0)).pad(8)
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
+    """A pair of zips and two files of instances, for the commands that read such files."""
+    from evaluate_cli_helpers import Inputs
+
+    return Inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.fixture(scope="module")
+def ticks() -> Iterator[Ticks]:
+    """PyVRP looks at the clock once per iteration; with this one it makes 1000 iterations a second on any machine."""
+    from classical_helpers import Ticks
+
+    from sb3_uav.solvers import limits, milp, ortools_routing, pyvrp_search
+
+    clock = Ticks()
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (limits, milp, ortools_routing, pyvrp_search):
+            patch.setattr(module, "time", clock)
+        yield clock
 
 
 @st.composite

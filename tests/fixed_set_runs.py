@@ -11,7 +11,7 @@ from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback
-from sb3_uav.training.fixed_set import EvaluationHistory
+from sb3_uav.training.fixed_set_history import EvaluationHistory
 
 NETWORK: dict[str, Any] = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
 BATCH_NORM: dict[str, Any] = dict(NETWORK, preset="paper")

@@ -154,7 +154,7 @@ def test_some_of_the_solvers(folder: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_every_look_is_another() -> None:
-    looks = [tuple(anytime._look(number).values()) for number in range(64)]
+    looks = [tuple(anytime.solver_style(number).values()) for number in range(64)]
     assert len(set(looks)) == 64
 
 

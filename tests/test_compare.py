@@ -9,7 +9,6 @@ import signal
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,15 +22,18 @@ from sb3_uav.plots.bands import Band, BandPanel, plot_bands, visible_range
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.training import fixed_set
-from sb3_uav.training.fixed_set import EvaluationHistory, FixedSetResult
+from sb3_uav.training.fixed_set_history import EvaluationHistory, FixedSetResult
 
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli
+from sb3_uav.cli.compare import make_parser
 from sb3_uav.common.statistics import confidence_halfwidth
-from sb3_uav.studies.compare import study as compare
+from sb3_uav.studies.compare.common_ground import make_validation_set
 from sb3_uav.studies.compare.fixed_router import DividedSubsets, pretrain_router
 from sb3_uav.studies.compare.report import Run, compute_band, compute_table, csv_text, estimate, interpolate
-from sb3_uav.studies.compare.runs import Training, run_trainings
+from sb3_uav.studies.compare.runs import ZooTraining, train_all
+from sb3_uav.studies.compare.settings import Settings
+from sb3_uav.studies.compare.study import with_common_ground
 from sb3_uav.studies.compare.variants import callback_name, callbacks_of, read_variants, router_settings
 
 ALLOCATION, ROUTING = "TaskAllocation-U3-N20-v0", "RoutePlanning-N20-v0"
@@ -133,8 +135,10 @@ def test_wide_bands_do_not_flatten_the_curves(tmp_path):
 # ------------------------------------------------------------------------------------------ variants
 
 
-def make_args(folder: Path, *flags: str) -> Any:
-    return compare.make_parser().parse_args(["--env", ALLOCATION, "--out", str(folder), "--eval-freq", "100", *flags])
+def make_settings(folder: Path, *flags: str) -> Settings:
+    args = vars(make_parser().parse_args(["--env", ALLOCATION, "--out", str(folder), "--eval-freq", "100", *flags]))
+    del args["report_only"]
+    return Settings(**args)
 
 
 @pytest.mark.parametrize("env_id", [ALLOCATION, ROUTING])
@@ -187,9 +191,9 @@ def test_bad_variants_are_named(text, message, tmp_path, monkeypatch):
 
 def test_all_variants_get_the_same_ground(tmp_path):
     """ITS and evaluations of the YAMLs make room for the common router and set; other callbacks stay."""
-    args = make_args(tmp_path, "-n", "1234", "--samples", "5")
+    settings = make_settings(tmp_path, "-n", "1234", "--samples", "5")
     for variant in read_variants(None, ALLOCATION):
-        entry = compare.complete(variant, args, True).entry
+        entry = with_common_ground(variant, settings, True).entry
         names = [callback_name(callback) for callback in callbacks_of(entry)]
         assert entry["n_timesteps"] == 1234 and names[-2:] == ["PretrainedRouterCallback", "FixedSetEvalCallback"]
         assert "ITSCallback" not in names and len(set(names)) == len(names)
@@ -198,7 +202,7 @@ def test_all_variants_get_the_same_ground(tmp_path):
         (evaluation,) = callbacks_of(entry)[-1].values()
         assert evaluation["instances"] == str(tmp_path / "validation.npz")
         fixed_set.FixedSetEvalCallback(**{**evaluation, "instances": None})
-        with_its = compare.complete(variant, make_args(tmp_path, "--its"), False).entry
+        with_its = with_common_ground(variant, make_settings(tmp_path, "--its"), False).entry
         assert [callback_name(callback) for callback in callbacks_of(with_its)].count("ITSCallback") == 1
 
 
@@ -258,7 +262,7 @@ def test_router_recipe_is_that_of_the_yaml():
 # ------------------------------------------------------------------------------------------ trainings
 
 
-class Fake(Training):
+class Fake(ZooTraining):
     """Leaves evaluations in place of a training; its config says in Python what to do before."""
 
     @property
@@ -287,7 +291,7 @@ def test_finished_runs_are_marked_and_others_start_again(tmp_path):
     training = fake(tmp_path)
     training.folder.mkdir()
     (training.folder / "half").write_text("an interrupted run")
-    run_trainings([training], 1)
+    train_all([training], 1)
     assert training.is_finished and not (training.folder / "half").exists()
     assert training.history.timesteps.tolist() == [0, 100]
     assert json.loads((training.folder / "finished.json").read_text())["command"].startswith("python -c")
@@ -305,7 +309,7 @@ def test_finished_runs_are_marked_and_others_start_again(tmp_path):
 def test_failed_runs_are_named_after_the_others_are_through(behaviour, steps, message, tmp_path):
     bad, good = fake(tmp_path, behaviour, steps), fake(tmp_path, seed=1)
     with pytest.raises(ValueError, match=f"1 of 2 trainings failed: .*{message}"):
-        run_trainings([bad, good], 1)
+        train_all([bad, good], 1)
     assert good.is_finished and not bad.is_finished
 
 
@@ -314,7 +318,7 @@ def test_jobs_run_side_by_side(tmp_path):
     wait = "open({0!r}, 'w')\nfor _ in range(600):\n    if os.path.exists({1!r}):\n        break\n    time.sleep(0.05)\n"
     wait += "else:\n    sys.exit('alone')"
     a, b = str(tmp_path / "a"), str(tmp_path / "b")
-    run_trainings([fake(tmp_path, wait.format(a, b)), fake(tmp_path, wait.format(b, a), seed=1)], 2)
+    train_all([fake(tmp_path, wait.format(a, b)), fake(tmp_path, wait.format(b, a), seed=1)], 2)
 
 
 def test_termination_ends_the_trainings_too(tmp_path):
@@ -328,7 +332,7 @@ def test_termination_ends_the_trainings_too(tmp_path):
 
     threading.Thread(target=terminate).start()
     with pytest.raises(KeyboardInterrupt):
-        run_trainings([training], 1)
+        train_all([training], 1)
     with pytest.raises(ProcessLookupError):
         os.kill(int(started.read_text()), 0)
     assert not training.is_finished
@@ -379,10 +383,10 @@ def test_validation_set_is_given_or_drawn_once(tmp_path):
     given_set = tmp_path / "given.npz"
     problem = TaskAllocationEnv(20, 3).problem
     problem.generator(4, np.random.default_rng(0)).save(given_set)
-    args = make_args(tmp_path / "out", "--instances", str(given_set))
-    args.out.mkdir()
-    compare.make_validation_set(args, problem)
-    assert th.equal(Instances.load(args.out / "validation.npz").tasks, Instances.load(given_set).tasks)
+    settings = make_settings(tmp_path / "out", "--instances", str(given_set))
+    settings.out.mkdir()
+    make_validation_set(settings, problem)
+    assert th.equal(Instances.load(settings.out / "validation.npz").tasks, Instances.load(given_set).tasks)
 
 
 @pytest.mark.slow

@@ -254,7 +254,7 @@ def test_an_instance_with_most_of_the_steps_does_not_fill_the_table_with_copies(
     results = []
     for limit in (grouping.source.numel() / len(indices) / 2, grouping.source.numel()):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("sb3_uav.policies.base.MAX_FILLING", limit)
+            patch.setattr("sb3_uav.policies.extractor.MAX_FILLING", limit)
             model.policy.features_extractor.n_encoded_rows = 0
             results.append(model.policy.evaluate_actions(observations, th.zeros(len(indices))))
             assert model.policy.features_extractor.n_encoded_rows == len(lengths)

@@ -31,7 +31,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback, fixed_set, fixed_set_returns
-from sb3_uav.training.fixed_set import draw_fixed_set, evaluate_fixed_set, fingerprint
+from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, fingerprint
 
 pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothing")
 

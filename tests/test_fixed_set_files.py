@@ -20,7 +20,7 @@ from sb3_uav.envs import BatchedVecEnv, Instances, TaskAllocationEnv
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import fixed_set
-from sb3_uav.training.fixed_set import evaluate_fixed_set, fingerprint
+from sb3_uav.training.fixed_set_returns import evaluate_fixed_set, fingerprint
 
 pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothing")
 

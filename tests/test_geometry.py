@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
-from sb3_uav.policies.encoder import StaticObservation
-from sb3_uav.policies.geometry import (
-    FARTHEST,
-    FULL,
-    N_NEIGHBOURS,
-    N_NEXT,
-    NEAR,
-    FleetGeometry,
-    MoveGeometry,
-    node_features,
-    scaled_coordinates,
-)
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.policies.fleet_geometry import FULL, N_NEIGHBORS, FleetFeature, FleetGeometry
+from sb3_uav.policies.geometry import FARTHEST, NEAR, NodeFeature, node_features, scaled_coordinates
+from sb3_uav.policies.move_geometry import N_NEXT, MoveFeature, MoveGeometry
+from sb3_uav.policies.static_observation import StaticObservation
 
 
 def static_of(instances: Instances) -> StaticObservation:
@@ -65,7 +59,7 @@ def test_features_of_a_move() -> None:
     # After it nothing more can be visited; both feasible tasks lie on the same side; cos 0.6 = 2.25 / (1.5 * 2.5).
     expected = [8 * 0.5, ratio, 2.5, slack, detour, left, 1.5, 2.0, onward, 2.0, 0, 0, math.log(3) / 3, 1.0, 0.6]
     assert features[2].tolist() == pytest.approx(expected, abs=1e-5)
-    assert features[4, 1] == 0
+    assert features[4, MoveFeature.RELATIVE_DISTANCE] == 0
 
 
 @settings(max_examples=50)
@@ -92,10 +86,10 @@ def test_what_a_move_leads_on_to(instances: Instances, left: float) -> None:
                 continue
             onwards = [distance for (distance, _), free in zip(near, is_open, strict=True) if free] + 3 * [FARTHEST]
             cluster = sum(min(distance, 0.25) for distance in onwards[:3]) / 3
-            assert features[row, j, 7].item() == pytest.approx(8 * min(onwards[0], 0.25), abs=1e-4)
-            assert features[row, j, 9].item() == pytest.approx(8 * cluster, abs=1e-4)
-            assert features[row, j, 10].item() == pytest.approx(sum(is_open[:4]) / 4)
-            assert features[row, j, 11].item() == pytest.approx(sum(is_open) / N_NEXT)
+            assert features[row, j, MoveFeature.ONWARD].item() == pytest.approx(8 * min(onwards[0], 0.25), abs=1e-4)
+            assert features[row, j, MoveFeature.CLUSTER].item() == pytest.approx(8 * cluster, abs=1e-4)
+            assert features[row, j, MoveFeature.OPEN_FEW].item() == pytest.approx(sum(is_open[:4]) / 4)
+            assert features[row, j, MoveFeature.OPEN_MANY].item() == pytest.approx(sum(is_open) / N_NEXT)
 
 
 def test_features_of_a_fleet() -> None:
@@ -109,28 +103,64 @@ def test_features_of_a_fleet() -> None:
         fleet = geometry.add(fleet, own, first)
     task = th.tensor([[2]])
     features = geometry.features(fleet, task, geometry.owners(task, th.tensor([[[0, 0, -1, -1]]])))[0, 0]
-    found = dict(zip(("load", "overload", "empty", "votes"), features[0, :4].tolist(), strict=True))
-    assert found == pytest.approx({"load": 1.5, "overload": 1.5 - FULL, "empty": 0.0, "votes": 1.0})
-    nearest, to_centroid, to_last, perimeter, grown = features[0, 5:10].tolist()
+    f = FleetFeature
+    found = [features[0, feature].item() for feature in (f.LOAD, f.OVERLOAD, f.EMPTY, f.VOTES)]
+    assert found == pytest.approx([1.5, 1.5 - FULL, 0.0, 1.0])
+    named = (f.NEAREST, f.CENTROID, f.LAST, f.PERIMETER, f.GROWTH)
+    nearest, to_centroid, to_last, perimeter, grown = (features[0, feature].item() for feature in named)
     assert nearest == pytest.approx(0.4) and to_last == pytest.approx(0.4)
     assert to_centroid == pytest.approx(math.hypot(0.4, 0.4))
     assert perimeter == pytest.approx(1.8) and grown == pytest.approx(0.0, abs=1e-6)
-    assert features[1, 0].item() == 0.5 and features[1, 2].item() == 1.0 and features[1, 3].item() == 0.0
-    assert features[1, 9].item() == pytest.approx(1.4)
+    assert features[1, f.LOAD].item() == 0.5 and features[1, f.EMPTY].item() == 1.0 and features[1, f.VOTES].item() == 0.0
+    assert features[1, f.GROWTH].item() == pytest.approx(1.4)
+
+
+def test_the_order_of_features_is_that_of_existing_weights() -> None:
+    """A new order would shuffle the inputs of every trained network."""
+    assert " ".join(feature.name for feature in NodeFeature) == (
+        "X Y HOME HOME_SQUARED DIRECTION_X DIRECTION_Y NEAREST DENSITY"
+    )
+    assert " ".join(feature.name for feature in MoveFeature) == (
+        "DISTANCE RELATIVE_DISTANCE HOME SLACK DETOUR REMAINING HOME_HERE ONWARD RELATIVE_ONWARD CLUSTER OPEN_FEW OPEN_MANY "
+        "N_FEASIBLE ON_SIDE ANGLE"
+    )
+    assert " ".join(feature.name for feature in FleetFeature) == (
+        "LOAD OVERLOAD EMPTY VOTES RELATIVE_DISTANCE NEAREST CENTROID LAST PERIMETER GROWTH TOWARDS HOME PROGRESS "
+        "TASKS_PER_UAV FLEET_SIZE N_EMPTY"
+    )
+    for kind in (NodeFeature, MoveFeature, FleetFeature):
+        assert [int(feature) for feature in kind] == list(range(len(kind)))
+
+
+def test_initial_weights_belong_to_their_features() -> None:
+    """Overload, votes and distance for the allocator, the distance of the move for the router's compatibilities."""
+    settings: dict[str, Any] = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
+    allocator = AllocatorPolicy(*AllocatorPolicy.placeholder_spaces(None), lambda _: 0.0, **settings)
+    router = RouterPolicy(*RouterPolicy.placeholder_spaces(None), lambda _: 0.0, **settings)
+    direct: Any = allocator.features_extractor.scorer.direct
+    weights = dict(zip(FleetFeature, direct.weight[0].tolist(), strict=True))
+    assert {feature: weight for feature, weight in weights.items() if weight != 0} == {
+        FleetFeature.OVERLOAD: -60.0,
+        FleetFeature.VOTES: 4.0,
+        FleetFeature.RELATIVE_DISTANCE: -0.5,
+    }
+    bias: Any = router.features_extractor.move_bias
+    assert bias.linear.weight.nonzero().tolist() == [[2, MoveFeature.RELATIVE_DISTANCE]]
+    assert bias.linear.weight[-1, MoveFeature.RELATIVE_DISTANCE] == -4.0
 
 
 @settings(max_examples=50)
 @given(instances=instance_batches())
-def test_neighbours_come_before_the_task_and_are_nearest(instances: Instances) -> None:
+def test_neighbors_come_before_the_task_and_are_nearest(instances: Instances) -> None:
     geometry = FleetGeometry.of(static_of(instances))
     for row in range(len(instances)):
         points = geometry.tasks[row].tolist()
         for task in range(int(instances.task_mask[row].sum())):
-            known = geometry.neighbour_distance[row, task] < FARTHEST
-            assert (geometry.neighbours[row, task][known] < task).all()
+            known = geometry.neighbor_distance[row, task] < FARTHEST
+            assert (geometry.neighbors[row, task][known] < task).all()
             all_before = sorted(min(math.dist(points[task], points[other]), FARTHEST) for other in range(task))
-            expected = [distance for distance in all_before[:N_NEIGHBOURS] if distance < FARTHEST - 1e-6]
-            found = [distance for distance in geometry.neighbour_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
+            expected = [distance for distance in all_before[:N_NEIGHBORS] if distance < FARTHEST - 1e-6]
+            found = [distance for distance in geometry.neighbor_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
             assert found == pytest.approx(expected, abs=1e-5)
 
 

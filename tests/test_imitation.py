@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch as th
-from test_solvers import make_policy
+from solver_helpers import make_policy
 
 from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv, UniformGenerator, check_schedule, nearest_feasible, schedules
 from sb3_uav.envs.allocation import plan_tours

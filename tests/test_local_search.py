@@ -6,6 +6,7 @@ import itertools
 import math
 import subprocess
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from types import SimpleNamespace
@@ -17,13 +18,14 @@ from conftest import instance_batches, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import ClusteredGenerator, Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.envs.schedule import InfeasibleScheduleError
 from sb3_uav.local_search import kernels
 from sb3_uav.local_search import search as local_search
 from sb3_uav.local_search.search import LocalSearch, improve, repair, repair_best
 from sb3_uav.solvers import base, kmeans_vnd, make_solver
-from sb3_uav.solvers.heuristics import kmeans
+from sb3_uav.solvers.kmeans import kmeans
 
 
 def random_schedule(instance: Instances, seed: int) -> Schedule:
@@ -35,6 +37,13 @@ def random_schedule(instance: Instances, seed: int) -> Schedule:
         if tour_length(instance, [*route, task]) <= float(instance.max_distance[0]) and rng.random() < 0.8:
             route.append(int(task))
     return Schedule(routes)
+
+
+def with_starts(batch: Instances, seed: int) -> Iterator[tuple[Instances, Schedule]]:
+    """Every instance of a batch with an empty and with a random schedule."""
+    for row in range(len(batch)):
+        yield batch[row], Schedule([])
+        yield batch[row], random_schedule(batch[row], seed)
 
 
 def tour_length(instance: Instances, route: list[int] | tuple[int, ...]) -> float:
@@ -63,13 +72,11 @@ def medium(n_tasks: int = 60, n_uavs: int = 3, seed: int = 0, valued: bool = Fal
 @given(instance_batches(max_tasks=12), seeds)
 def test_repair_of_anything(batch: Instances, seed: int) -> None:
     """Feasible, never worse, and a second repair changes nothing, whatever the instance and the schedule."""
-    for row in range(len(batch)):
-        instance = batch[row]
-        for start in (Schedule([]), random_schedule(instance, seed)):
-            for max_string in (0, 3):
-                repaired = repair(instance, start, max_string=max_string)
-                assert rank(instance, repaired) >= rank(instance, start)
-                assert repair(instance, repaired, max_string=max_string) == repaired
+    for instance, start in with_starts(batch, seed):
+        for max_string in (0, 3):
+            repaired = repair(instance, start, max_string=max_string)
+            assert rank(instance, repaired) >= rank(instance, start)
+            assert repair(instance, repaired, max_string=max_string) == repaired
 
 
 @settings(max_examples=15)
@@ -231,12 +238,10 @@ def test_wrong_arguments() -> None:
 @given(instance_batches(max_tasks=12), seeds)
 def test_improvement_of_anything(batch: Instances, seed: int) -> None:
     """Feasible, never worse, and the seed decides."""
-    for row in range(len(batch)):
-        instance = batch[row]
-        for start in (Schedule([]), random_schedule(instance, seed)):
-            improved = improve(instance, start, seed=seed)
-            assert rank(instance, improved) >= rank(instance, start)
-            assert improve(instance, start, seed=seed) == improved
+    for instance, start in with_starts(batch, seed):
+        improved = improve(instance, start, seed=seed)
+        assert rank(instance, improved) >= rank(instance, start)
+        assert improve(instance, start, seed=seed) == improved
 
 
 @pytest.mark.parametrize("valued", [False, True])
@@ -316,7 +321,7 @@ except ImportError as error:
     print(error)
 """
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "pip install 'sb3-uav[solvers]'" in printed
+    assert install_command("solvers") in printed
 
 
 # ------------------------------------------------------------------------------------------------------------- K-means+VND

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator
 from sb3_uav.envs.render import UAV_COLOURS
 from sb3_uav.plots import MapPanel, learning_curves, plot_learning_curves, plot_schedule, plot_schedules
@@ -222,7 +224,7 @@ def test_without_matplotlib(log: Path, instances: Instances, tmp_path: Path, mon
         lambda: plot_learning_curves(log, tmp_path / "curves.png"),
         lambda: plot_schedule(instances, 0, Schedule([[0]]), tmp_path / "map.png"),
     ):
-        with pytest.raises(ImportError, match=r"pip install 'sb3-uav\[plots\]'"):
+        with pytest.raises(ImportError, match=re.escape(install_command("plots"))):
             draw()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_solvers import objectives
+from solver_helpers import objectives
 
 from sb3_uav import pretrained
 from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, UniformGenerator

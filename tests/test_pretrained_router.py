@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from sb3_uav.envs import BatchedVecEnv, UniformGenerator, nearest_feasible
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback, PretrainedRouterCallback
-from sb3_uav.training.fixed_set import evaluate_fixed_set
+from sb3_uav.training.fixed_set_returns import evaluate_fixed_set
 
 pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothing")
 

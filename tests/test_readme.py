@@ -10,12 +10,19 @@ from sb3_uav.envs import Instances, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+ROOT = Path(__file__).parents[1]
 
 
-def test_example_of_the_first_screen(tmp_path, monkeypatch):
-    example = EXAMPLES[0]
+def python_examples(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+PLANNING, TRAINING = python_examples("README.md")
+(PPO,) = python_examples("docs/training.md")
+
+
+def test_example_of_training(tmp_path, monkeypatch):
+    example = TRAINING
     assert len([line for line in example.splitlines() if line and "import" not in line]) <= 8
     for full, small in (
         ("n_envs=64", "n_envs=4"),
@@ -31,7 +38,7 @@ def test_example_of_the_first_screen(tmp_path, monkeypatch):
 
 
 def test_example_of_ppo():
-    example = EXAMPLES[2]
+    example = PPO
     for full, small in (("n_envs=64", "n_envs=4"), ("learn(300_000)", "learn(320)")):
         assert full in example
         example = example.replace(full, small)
@@ -40,17 +47,12 @@ def test_example_of_ppo():
     assert type(variables["model"].policy) is RouterPolicy and variables["model"].num_timesteps >= 320
 
 
-def test_example_of_a_schedule_now(tmp_path, monkeypatch):
+def test_example_of_planning(tmp_path, monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.chdir(tmp_path)
     variables: dict[str, Any] = {}
-    exec(EXAMPLES[1].replace("rand(16, ", "rand(2, "), variables)
+    exec(PLANNING.replace("rand(16, ", "rand(2, "), variables)
     instances = Instances.load(tmp_path / "my_instances.npz")
     assert instances.n_uavs == 4 and len(variables["schedules"]) == 2
     for row, schedule in enumerate(variables["schedules"]):
         assert check_schedule(instances, row, schedule).objective > 60
-
-
-@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\(([^)#:]+)\)", README))))
-def test_links_lead_somewhere(target):
-    assert (Path(__file__).parents[1] / target).is_file()

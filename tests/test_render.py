@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 
 import numpy as np
@@ -10,10 +11,8 @@ import pytest
 from env_helpers import act, batched_env, both_levels, env_fns, legal_actions, make, play, rendered, reset
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_uav.envs import (
-    BatchedVecEnv,
-    RoutePlanningEnv,
-)
+from sb3_uav.common.optional import install_command
+from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv
 
 
 @both_levels
@@ -73,7 +72,7 @@ def test_drawing_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     env = RoutePlanningEnv(n_tasks=3, render_mode="rgb_array")
     env.reset(seed=0)
-    with pytest.raises(ImportError, match=r"Drawing needs matplotlib; run: pip install 'sb3-uav\[plots\]'"):
+    with pytest.raises(ImportError, match=f"Drawing needs matplotlib; run: {re.escape(install_command('plots'))}"):
         env.render()
 
 

@@ -23,7 +23,7 @@ from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id, routi
 pytest.importorskip("rl_zoo3")
 from sb3_uav.training import EpisodeBufferCallback, FixedSetEvalCallback, ITSCallback
 from sb3_uav.zoo import enjoy, train
-from sb3_uav.zoo.experiment import default_config
+from sb3_uav.zoo.configs import default_config
 
 ROUTING, ALLOCATION = "RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"
 TINY_NETWORK = "dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)"

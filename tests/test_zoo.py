@@ -24,9 +24,9 @@ from sb3_uav.training.its_checkpoint import read_state
 
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli
-from sb3_uav.cli.demo import evaluate_run, newest_run
+from sb3_uav.studies.demo import evaluate_run, newest_run
 from sb3_uav.zoo import enjoy, train
-from sb3_uav.zoo.experiment import default_config, parse_schedule, plain_numbers
+from sb3_uav.zoo.configs import default_config, parse_schedule, plain_numbers
 
 ENV = "TaskAllocation-U3-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from sb3_uav.common.random_streams import TEST_SEED
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id
 
 
@@ -19,7 +15,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     Train a pair with all phases of the ITS, evaluate it beside simple heuristics, draw learning curves and a schedule.
 
     :param argv: Command line arguments; those of the process when None
-    :return: Exit code
+    :return: Exit code: 1 if a schedule was infeasible
+    :raises ValueError: If an argument is wrong
+    :raises OSError: If a file cannot be read or written
+    :raises ImportError: If a package that the demo needs is not installed
     """
     parser = argparse.ArgumentParser(prog="sb3-uav demo", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder of all results (default: %(default)s)")
@@ -28,10 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     args, train_args = parser.parse_known_args(argv)
 
-    from sb3_uav.zoo import train
+    from sb3_uav.studies.demo import evaluate_run, newest_run
+    from sb3_uav.zoo.train import train
 
     logs = args.out / "logs"
-    code = train.main(
+    train(
         [
             *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
             *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
@@ -42,106 +42,4 @@ def main(argv: Sequence[str] | None = None) -> int:
             *train_args,
         ]
     )
-    if code != 0:
-        return code
-    try:
-        return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
-    except (ValueError, FileNotFoundError, ImportError) as error:
-        print(f"sb3-uav demo: {error}", file=sys.stderr)
-        return 2
-
-
-def newest_run(folder: Path, env_id: str) -> Path:
-    """
-    :param folder: rl_zoo3's folder of an algorithm
-    :param env_id: Id of an environment
-    :return: Its run with the highest number
-    """
-    runs = [path for path in folder.glob(f"{env_id}_*") if path.name.rpartition("_")[2].isdigit()]
-    return max(runs, key=lambda path: int(path.name.rpartition("_")[2]))
-
-
-def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int) -> int:
-    """
-    Evaluate what a training run left beside heuristics, print the table and draw the figures.
-
-    :param run: rl_zoo3's folder of the run
-    :param env_id: Id of its environment
-    :param out: Folder of the results
-    :param n_instances: Number of test instances
-    :param seed: Seed of the solvers
-    :return: Exit code: 1 if a schedule was infeasible
-    """
-    import gymnasium as gym
-
-    from sb3_uav.envs import TaskAllocationEnv
-    from sb3_uav.evaluation.run import RESULTS_FILE, evaluate, print_table
-    from sb3_uav.plots.learning_curves import plot_learning_curves
-    from sb3_uav.plots.schedule_map import MapPanel, plot_schedules
-    from sb3_uav.policies import AllocatorPolicy, RouterPolicy
-    from sb3_uav.policies.loading import load_policy
-    from sb3_uav.solvers.base import Solver, make_solver
-    from sb3_uav.solvers.dl_drl import DLDRL
-    from sb3_uav.training.epoch_log import LOG_FILE
-
-    environment = gym.make(env_id).unwrapped
-    assert isinstance(environment, TaskAllocationEnv)
-    instances = environment.problem.generator(n_instances, np.random.default_rng(TEST_SEED))
-    instances.save(out / "instances.npz")
-
-    allocator = load_policy(run / f"{env_id}.zip", expected=AllocatorPolicy)
-    router = load_policy(run / "router.zip", expected=RouterPolicy)
-    greedy, sampling = DLDRL(allocator, router), DLDRL(allocator, router, "sampling")
-    heuristics = [make_solver("kmeans-nearest"), make_solver("random-nearest")]
-    solvers: list[Solver] = [greedy, sampling, greedy.untrained(seed), *heuristics]
-    print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
-    summary = evaluate(solvers, {env_id: instances}, out / "results", seed)
-    print_table(summary)
-    print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
-
-    plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
-    # The one whose depot lies most centrally shows most of what a fleet can do.
-    row = int((instances.depot - 0.5).norm(dim=1).argmin())
-    panels = []
-    for solver in (sampling, heuristics[0]):
-        schedule = solver.solve(instances[row], seed=seed)[0].schedule
-        panels.append(MapPanel(instances, row, schedule, f"{solver.name}: {schedule.n_visited} tasks"))
-    plot_schedules(panels, out / "schedule.png")
-    files = {
-        "trained allocator": run / f"{env_id}.zip",
-        "trained router": run / "router.zip",
-        "results": out / "results" / "results.csv",
-        "schedules": out / "results" / "schedules.jsonl",
-        "learning curves": out / "learning_curves.png",
-        "a schedule": out / "schedule.png",
-    }
-    for what, path in files.items():
-        print(f"{what:>18}: {path}")
-    print(f"{'training curves':>18}: tensorboard --logdir {out / 'tensorboard'}")
-    return int(any(row.violations for row in summary))
-
-
-def print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
-    """
-    Print by how much we are better than others, instance by instance.
-
-    :param results: The ``results.csv`` of an evaluation
-    :param ours: Names of the solvers to compare
-    :param others: Names of the solvers to compare them with
-    """
-    with results.open() as file:
-        rows = list(csv.DictReader(file))
-    objectives = {
-        name: np.array([float(row["objective"] or "nan") for row in rows if row["solver"] == name])
-        for name in (*ours, *others)
-    }
-    for name in ours:
-        for other in others:
-            gain = objectives[name] - objectives[other]
-            error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else float("nan")
-            relative = gain.mean() / objectives[other].mean()
-            print(f"{name} against {other}: {gain.mean():+.2f} tasks ({relative:+.1%}), standard error {error:.2f}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)

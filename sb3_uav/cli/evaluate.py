@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_uav.common.optional import install_command
+
 if TYPE_CHECKING:
     from sb3_uav.envs import Instances
     from sb3_uav.solvers import Solver
@@ -104,9 +106,8 @@ def make_solvers(args: argparse.Namespace) -> list[Solver]:
     :raises FileNotFoundError: If a zip is missing
     :raises ValueError: If a zip is damaged, or another argument is not allowed
     """
-    from sb3_uav.evaluation.run import UnavailableSolver
-    from sb3_uav.solvers.base import make_solver
-    from sb3_uav.solvers.limits import UnavailableError
+    from sb3_uav.solvers import make_solver
+    from sb3_uav.solvers.unavailable import UnavailableError, UnavailableSolver
 
     if (args.allocator is None) != (args.router is None):
         missing = "--allocator" if args.allocator is None else "--router"
@@ -144,7 +145,7 @@ class ProgressLines:
             try:
                 from tqdm import tqdm
             except ImportError as error:
-                raise ImportError("The progress bar needs tqdm; run: pip install 'sb3-uav[solvers]'") from error
+                raise ImportError(f"The progress bar needs tqdm; run: {install_command('solvers')}") from error
             self._make_bar = partial(tqdm, leave=False, unit="instance", dynamic_ncols=True)
 
     def __enter__(self) -> ProgressLines:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs.instances import Instances
 
 logger = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ def require_matplotlib() -> Any:
         import matplotlib
         import matplotlib.figure
     except ImportError as error:
-        raise ImportError("Drawing needs matplotlib; run: pip install 'sb3-uav[plots]'") from error
+        raise ImportError(f"Drawing needs matplotlib; run: {install_command('plots')}") from error
     return matplotlib
 
 

@@ -10,7 +10,9 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import NamedTuple
+from multiprocessing.connection import wait as wait_for_handles
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -105,6 +107,32 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+class _RecordingContext(SpawnContext):
+    """
+    Starts processes for an executor and keeps them, because an executor offers no way to end its own before Python 3.14.
+
+    :ivar processes: All that were started
+    """
+
+    def __init__(self) -> None:
+        self.processes: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        process = SpawnProcess(*args, **kwargs)
+        self.processes.append(process)
+        return process
+
+    def end_all(self) -> None:
+        """Kill all processes, whatever they are doing, and wait until they have ended."""
+        started = [process for process in self.processes if process.pid is not None]
+        for process in started:
+            process.kill()
+        # Not by joining them: the executor's own thread does that, and only one of the two would see the exit code.
+        alive = {process.sentinel for process in started}
+        while alive:
+            alive.difference_update(wait_for_handles(alive))
+
+
 class Runner:
     """
     Runs solvers, :class:`OneByOneSolver` in parallel processes if there shall be more than one. Use it as a context manager.
@@ -118,6 +146,7 @@ class Runner:
             raise ValueError(f"The number of jobs is {n_jobs}; give at least 1.")
         self.n_jobs = n_jobs
         self._pool: ProcessPoolExecutor | None = None
+        self._context = _RecordingContext()
 
     def __enter__(self) -> Runner:
         return self
@@ -185,7 +214,8 @@ class Runner:
 
     def _submit(self, task: Task) -> Future[SolverResult | Failure]:
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.n_jobs, multiprocessing.get_context("spawn"), _start_worker)
+            self._context = _RecordingContext()
+            self._pool = ProcessPoolExecutor(self.n_jobs, self._context, _start_worker)
         try:
             return self._pool.submit(task.run)
         except BrokenProcessPool:
@@ -196,9 +226,6 @@ class Runner:
         """End all processes, whatever they are doing."""
         if self._pool is None:
             return
-        # As terminate_workers of Python 3.14 does.
-        processes = list((self._pool._processes or {}).values())
         self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
+        self._context.end_all()
         self._pool = None

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.evaluation.summary import SummaryRow
 
 
@@ -21,7 +22,7 @@ def require_rich() -> Any:
         import rich.table
         import rich.text
     except ImportError as error:
-        raise ImportError("Printing tables needs rich; run: pip install 'sb3-uav[solvers]'") from error
+        raise ImportError(f"Printing tables needs rich; run: {install_command('solvers')}") from error
     return rich
 
 

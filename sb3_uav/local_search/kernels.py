@@ -15,10 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.optional import install_command
+
 try:
     from numba import njit
 except ImportError as error:
-    raise ImportError("Local search needs numba; run: pip install 'sb3-uav[solvers]'") from error
+    raise ImportError(f"Local search needs numba; run: {install_command('solvers')}") from error
 
 # Changes of a tour's length below this are rounding errors; tours are at most 1 long.
 EPSILON = 1e-12

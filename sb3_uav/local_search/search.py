@@ -98,8 +98,14 @@ class LocalSearch:
         """
         return check_schedule(self.instance, 0, schedule)
 
-    def _better(self, found: Schedule, given: Schedule) -> Schedule:
-        """``found``, unless ``given`` is better. Kernels compare sums with rounding errors; this does not."""
+    def better(self, found: Schedule, given: Schedule) -> Schedule:
+        """
+        Compare two schedules without the rounding errors of the kernels' sums.
+
+        :param found: A feasible schedule
+        :param given: Another one
+        :return: ``found``, unless ``given`` has a larger value, or the same value and shorter tours
+        """
         new, old = self.report(found), self.report(given)
         return found if (new.objective, -new.length) >= (old.objective, -old.length) else given
 
@@ -110,7 +116,7 @@ class LocalSearch:
         plan = self._load(schedule)
         while time.perf_counter() < end and kernels.descend(plan, N_NEAR_JOINED, N_NEAR_INSERTED, max_string):
             pass
-        return self._better(self._unload(plan), schedule)
+        return self.better(self._unload(plan), schedule)
 
     def improve(
         self,
@@ -136,7 +142,7 @@ class LocalSearch:
         end = start + (np.inf if seconds is None else seconds + LAST_REPAIR_SECONDS)
         while time.perf_counter() < end and kernels.descend(best, N_NEAR_JOINED, N_NEAR_INSERTED, MAX_STRING):
             pass
-        return self._better(self._unload(best), schedule)
+        return self.better(self._unload(best), schedule)
 
     @staticmethod
     def _anneal(plan: Plan, best: Plan, start: float, seconds: float, settings: AnnealingSettings) -> None:
@@ -212,7 +218,7 @@ def repair_best(instance: Instances, schedules: Iterable[Schedule], seconds: flo
         left = end - time.perf_counter()
         if left <= 0:
             break
-        best = search._better(search.repair(schedule, left), best)
+        best = search.better(search.repair(schedule, left), best)
     return best
 
 

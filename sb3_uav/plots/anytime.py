@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_uav.common.statistics import confidence_halfwidth
-from sb3_uav.envs.render import UAV_COLOURS, require_matplotlib
+from sb3_uav.envs.render import require_matplotlib
 from sb3_uav.evaluation.results import OK, RESULTS_FILE, ResultRow, read_results
-from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
+from sb3_uav.plots.style import DASHED, MARKERS, SERIES_COLORS, style_axes
 
 PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LEGEND_WIDTH = 34
 FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
 
@@ -154,26 +154,25 @@ def _unique(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _look(number: int) -> dict[str, str]:
-    """Colour and marker of a solver; those after the eighth have the same colours, but other markers with them."""
-    n_colours = len(UAV_COLOURS)
-    return {"color": UAV_COLOURS[number % n_colours], "marker": MARKERS[(number + number // n_colours) % len(MARKERS)]}
+def solver_style(number: int) -> dict[str, str]:
+    """
+    :param number: Number of a solver
+    :return: Its color and marker; solvers after the eighth reuse the colors with other markers
+    """
+    n_colors = len(SERIES_COLORS)
+    return {"color": SERIES_COLORS[number % n_colors], "marker": MARKERS[(number + number // n_colors) % len(MARKERS)]}
 
 
 def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
     """
     :param axes: matplotlib axes
     :param panel: What to draw
-    :param numbers: Number of every solver, which decides on its look
+    :param numbers: Number of every solver, which determines its color and marker
     """
     ticker = require_matplotlib().ticker
-    axes.set_title(f"{panel.source}: {panel.n_instances} instances", fontsize=11, loc="left")
+    title = f"{panel.source}: {panel.n_instances} instances"
+    style_axes(axes, title, "seconds per instance (mean)", "objective (mean)", "both")
     axes.set_xscale("log")
-    axes.set_xlabel("seconds per instance (mean)")
-    axes.set_ylabel("objective (mean)")
-    axes.grid(color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
     times = np.concatenate([curve.seconds for curve in panel.curves]) if panel.curves else np.ones(1)
     # A point needs room on both sides, and a line to lead somewhere.
     axes.set_xlim(times.min() / 2, times.max() * 2)
@@ -184,7 +183,7 @@ def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
     axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda seconds, _: f"{seconds:g}"))
     # The legend reads from the best down, as the panel does.
     for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
-        look = _look(numbers[curve.solver])
+        look = solver_style(numbers[curve.solver])
         name = textwrap.fill(curve.solver.replace(",", ", "), LEGEND_WIDTH, break_on_hyphens=False)
         label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
         low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth
@@ -194,7 +193,7 @@ def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
         else:
             until = axes.get_xlim()[1]
             axes.plot(curve.seconds, curve.objective, **look, linestyle="none", markersize=6, label=label)
-            axes.hlines(curve.objective, curve.seconds, until, color=look["color"], linestyle=(0, (4, 3)), linewidth=1.2)
+            axes.hlines(curve.objective, curve.seconds, until, color=look["color"], linestyle=DASHED, linewidth=1.2)
             axes.vlines(curve.seconds, low, high, color=look["color"], linewidth=1.2)
     if panel.curves:
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5, frameon=False, borderaxespad=0.0)

@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
+from sb3_uav.plots.style import LINE_STYLES, SERIES_COLORS, style_axes
 
-# Okabe and Ito's colours, which colour-blind people can tell apart.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-LINE_STYLES = ("-", "--", ":", "-.")
 PANEL_WIDTH, PANEL_HEIGHT = 5.2, 3.6
 
 
@@ -64,18 +62,15 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
             for number, name in enumerate(names):
                 if name not in panel.bands:
                     continue
-                band, colour = panel.bands[name], COLOURS[number % len(COLOURS)]
-                # Dashed as well as coloured, because a curve may lie upon another.
+                band, color = panel.bands[name], SERIES_COLORS[number % len(SERIES_COLORS)]
+                # Dashed as well as colored, because one curve may cover another.
                 style = LINE_STYLES[number % len(LINE_STYLES)]
-                axes.plot(band.x, band.mean, color=colour, linestyle=style, linewidth=1.6, label=name)
+                axes.plot(band.x, band.mean, color=color, linestyle=style, linewidth=1.6, label=name)
                 low, high = band.mean - band.half_width, band.mean + band.half_width
-                axes.fill_between(band.x, low, high, color=colour, alpha=0.2, linewidth=0)
+                axes.fill_between(band.x, low, high, color=color, alpha=0.2, linewidth=0)
             axes.set_ylim(visible_range(panel.bands.values()))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.set_xlabel(panel.x_label)
-            axes.set_ylabel(panel.y_label)
-            axes.grid(color="0.88", linewidth=0.8)
-            axes.spines[["top", "right"]].set_visible(False)
+            style_axes(axes, "", panel.x_label, panel.y_label, "both")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=min(len(names), 4), frameon=False, fontsize=9)
     save_figure(figure, path)

@@ -9,16 +9,15 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
+from sb3_uav.plots.style import GREEN, MAX_MARKERS, ORANGE, SKY_BLUE, style_axes
 
 LOG_FILE = "its_log.csv"
 LEVELS = ("allocator", "router")
 COLUMNS = {"epoch", "level", "phase", "objective"}
-PHASE_COLOURS = {"pre-training": "#56B4E9", "intensive": "#E69F00", "alternate": "#009E73"}
+PHASE_COLORS = {"pre-training": SKY_BLUE, "intensive": ORANGE, "alternate": GREEN}
 SPELLINGS = {"pretraining": "pre-training"}
-LINE_COLOUR = "#222222"
-# With more epochs than this, markers hide the line.
-MAX_MARKERS = 40
+LINE_COLOR = "#222222"
 
 
 class LoggedEpoch(NamedTuple):
@@ -49,8 +48,7 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
     figure = new_figure(8.0, 6.4)
     titles = ("Upper level (allocator), all UAVs", "Lower level (router), per UAV")
     for axes, level, title in zip(figure.subplots(2, 1), LEVELS, titles, strict=True):
-        _draw_level(axes, epochs[level])
-        axes.set_title(title, fontsize=11, loc="left")
+        _draw_level(axes, title, epochs[level])
     save_figure(figure, path)
 
 
@@ -87,33 +85,31 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
     return {level: sorted(rows) for level, rows in epochs.items()}
 
 
-def _draw_level(axes: Any, epochs: Sequence[LoggedEpoch]) -> None:
+def _draw_level(axes: Any, title: str, epochs: Sequence[LoggedEpoch]) -> None:
     """
     :param axes: matplotlib axes
+    :param title: Title of the panel
     :param epochs: Of one level, in order
     """
-    axes.set_xlabel("epoch")
-    axes.set_ylabel("tasks completed (mean)")
-    axes.grid(axis="y", color="0.85", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
+    style_axes(axes, title, "epoch", "tasks completed (mean)")
     if not epochs:
         axes.set_xticks([])
         axes.set_yticks([])
         axes.text(0.5, 0.5, "no epochs", transform=axes.transAxes, ha="center", va="center", color="0.5")
         return
-    labelled: set[str] = set()
+    labeled: set[str] = set()
     for phase, run in groupby(epochs, key=lambda epoch: epoch.phase):
         numbers = [epoch.epoch for epoch in run]
-        if phase not in PHASE_COLOURS:
+        if phase not in PHASE_COLORS:
             continue
-        label = None if phase in labelled else phase
-        labelled.add(phase)
-        axes.axvspan(numbers[0] - 0.5, numbers[-1] + 0.5, color=PHASE_COLOURS[phase], alpha=0.2, linewidth=0, label=label)
+        label = None if phase in labeled else phase
+        labeled.add(phase)
+        axes.axvspan(numbers[0] - 0.5, numbers[-1] + 0.5, color=PHASE_COLORS[phase], alpha=0.2, linewidth=0, label=label)
     marker = "o" if len(epochs) <= MAX_MARKERS else None
     numbers, objectives = [epoch.epoch for epoch in epochs], [epoch.objective for epoch in epochs]
-    axes.plot(numbers, objectives, color=LINE_COLOUR, linewidth=1.5, marker=marker, markersize=4)
+    axes.plot(numbers, objectives, color=LINE_COLOR, linewidth=1.5, marker=marker, markersize=4)
     axes.set_xlim(numbers[0] - 0.5, numbers[-1] + 0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
-    if labelled:
-        # Above the panel, where the colours stand on white as they do in the panel.
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), fontsize=9, frameon=False, ncols=len(labelled))
+    if labeled:
+        # Above the panel, where the colors are on white as in the panel.
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), fontsize=9, frameon=False, ncols=len(labeled))

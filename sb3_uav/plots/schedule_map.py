@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.render import draw_map
 from sb3_uav.envs.schedule import Schedule
-from sb3_uav.plots.figures import checked_path, new_figure, save_figure
+from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
 # Two UAVs stand side by side in the legend below a map.
@@ -36,7 +36,7 @@ class MapPanel(NamedTuple):
 
 def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str | os.PathLike[str], title: str = "") -> None:
     """
-    Draw one schedule: the depot, tours coloured by UAV, skipped tasks hollow, counts and lengths in the legend.
+    Draw one schedule: the depot, tours colored by UAV, skipped tasks hollow, counts and lengths in the legend.
 
     :param instances: The instances
     :param row: Which of them

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,15 +17,38 @@ from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.sweep import sweep_order
-from sb3_uav.policies.base import PRESETS, Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
-from sb3_uav.policies.encoder import StaticObservation
-from sb3_uav.policies.geometry import N_FLEET_FEATURES, FleetGeometry, FleetState
+from sb3_uav.policies.base import EpisodicPolicy, sample_actions
+from sb3_uav.policies.encoder import feed_forward
+from sb3_uav.policies.extractor import Cache, EpisodicExtractor
+from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
+from sb3_uav.policies.settings import NetworkSettings
+from sb3_uav.policies.static_observation import StaticObservation
 
 # Hidden size of the scorer.
 SCORER_DIM = 64
-# What the scorer prefers before training (indices of FleetGeometry.features): the UAV that has the task's neighbours, until it
-# has about its share.
-OVERLOAD, VOTES, RELATIVE_DISTANCE = (1, -60.0), (3, 4.0), (4, -0.5)
+# What the scorer adds up before training: the untrained allocator gives a task to the UAV that has its neighbors, until that
+# UAV has about its share. Decoded greedily, this is about as good as a trained allocator.
+INITIAL_SCORE = {
+    # From 95 % of its share on, every further per cent makes a UAV e^0.6 times less likely: one task over the share outweighs
+    # all votes with up to 50 tasks per UAV, and later ones do beyond that.
+    FleetFeature.OVERLOAD: -60.0,
+    # A UAV that has all the neighbors is e^4, about 50 times likelier than one that has none of them.
+    FleetFeature.VOTES: 4.0,
+    # Twice as far away from the task is 2^-0.5 times as likely, so that distance decides between equal votes only.
+    FleetFeature.RELATIVE_DISTANCE: -0.5,
+}
+
+
+@dataclass(frozen=True)
+class AllocatorCache(Cache):
+    """
+    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
+    :param scorer_nodes: ``(batch, n_tasks + 1, SCORER_DIM)``, their projections for the shared scorer; None without it
+    :param geometry: Measures of the instances; None without ``geometry``
+    """
+
+    scorer_nodes: th.Tensor | None = None
+    geometry: FleetGeometry | None = None
 
 
 class AllocatorState(NamedTuple):
@@ -32,7 +56,7 @@ class AllocatorState(NamedTuple):
     :param context: ``(batch, n_samples, n_uavs, embed_dim)``, element-wise maximum of the embeddings of the depot and of the
         UAV's tasks (paper, equation (16))
     :param task: ``(batch, n_samples)`` int64, the task to allocate
-    :param features: ``(batch, n_samples, n_uavs, N_FLEET_FEATURES)``, how the task fits to each UAV; None without geometry
+    :param features: ``(batch, n_samples, n_uavs, len(FleetFeature))``, how the task fits to each UAV; None without geometry
     """
 
     context: th.Tensor
@@ -53,22 +77,22 @@ class SharedScorer(nn.Module):
         self.project_task = nn.Linear(embed_dim, SCORER_DIM)
         self.project_uav = nn.Linear(embed_dim, SCORER_DIM, bias=False)
         self.project_fleet = nn.Linear(embed_dim, SCORER_DIM, bias=False)
-        self.project_features = nn.Linear(N_FLEET_FEATURES, SCORER_DIM, bias=False) if geometry else None
+        self.project_features = nn.Linear(len(FleetFeature), SCORER_DIM, bias=False) if geometry else None
         self.hidden = nn.Sequential(nn.ReLU(), nn.Linear(SCORER_DIM, SCORER_DIM), nn.ReLU())
         self.score = nn.Linear(SCORER_DIM, 1)
-        self.direct = nn.Linear(N_FLEET_FEATURES, 1, bias=False) if geometry else None
+        self.direct = nn.Linear(len(FleetFeature), 1, bias=False) if geometry else None
         if self.direct is not None:
             for parameter in (*self.direct.parameters(), *self.score.parameters()):
                 nn.init.zeros_(parameter)
             with th.no_grad():
-                for column, weight in (OVERLOAD, VOTES, RELATIVE_DISTANCE):
-                    self.direct.weight[0, column] = weight
+                for feature, weight in INITIAL_SCORE.items():
+                    self.direct.weight[0, feature] = weight
 
     def forward(self, context: th.Tensor, task: th.Tensor, features: th.Tensor | None) -> th.Tensor:
         """
         :param context: ``(batch, n_samples, n_uavs, embed_dim)``
         :param task: ``(batch, n_samples, SCORER_DIM)``, a projected task
-        :param features: ``(batch, n_samples, n_uavs, N_FLEET_FEATURES)``
+        :param features: ``(batch, n_samples, n_uavs, len(FleetFeature))``
         :return: ``(batch, n_samples, n_uavs)``
         """
         mixed = self.project_uav(context) + (task + self.project_fleet(context.mean(2)))[:, :, None]
@@ -85,80 +109,41 @@ class AllocatorExtractor(EpisodicExtractor):
     With ``net_arch=[]`` on top, SB3's action layer is the paper's last equation (19).
     With ``shared_scorer`` they are [score of every UAV, embedding of the current task], and the scores are the logits.
 
-    :param observation_space: Of a ``TaskAllocation`` environment
-    :param embed_dim: Size of the embeddings
-    :param n_layers: Number of attention layers
-    :param n_heads: Number of heads
-    :param ff_dim: Hidden size of the feed-forward layers
-    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
-    :param use_values: Whether task values are features of the encoder
-    :param relative: Whether the encoder sees scaled coordinates relative to the depot
-    :param geometry: Whether the shared scorer is told distances and loads
-    :param shared_scorer: Whether one scorer judges all UAVs
-    :param mixed_precision: Whether the encoder computes in bfloat16
+    :param observation_space: Observation space of a ``TaskAllocation`` environment
+    :param settings: Fields of :class:`~sb3_uav.policies.settings.NetworkSettings`
+    :raises TypeError: If there is no such setting
+    :raises ValueError: If a setting or the observation space is not allowed
     """
 
     environment = "TaskAllocation"
     own_key = "assignment"
-    foreign_settings = frozenset({"sweep", "bias_dim"})
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        embed_dim: int = 128,
-        n_layers: int = 3,
-        n_heads: int = 8,
-        ff_dim: int = 512,
-        normalization: str = "instance",
-        use_values: bool = True,
-        relative: bool = False,
-        geometry: bool = False,
-        shared_scorer: bool = False,
-        mixed_precision: bool = False,
-    ) -> None:
-        n_uavs = self.n_actions(observation_space)
-        super().__init__(
-            observation_space,
-            n_uavs + embed_dim if shared_scorer else 2 * embed_dim,
-            embed_dim=embed_dim,
-            n_layers=n_layers,
-            n_heads=n_heads,
-            ff_dim=ff_dim,
-            normalization=normalization,
-            use_values=use_values,
-            relative=relative,
-            mixed_precision=mixed_precision,
-        )
-        self.geometry = geometry and shared_scorer
-        self.n_uavs = None if shared_scorer else n_uavs
-        if shared_scorer:
+    def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
+        network = NetworkSettings.of(settings)
+        n_uavs, embed_dim = self.n_actions(observation_space), network.embed_dim
+        super().__init__(observation_space, (n_uavs if network.shared_scorer else embed_dim) + embed_dim, network)
+        self.geometry = network.geometry and network.shared_scorer
+        self.n_uavs = None if network.shared_scorer else n_uavs
+        if network.shared_scorer:
             self.context_dim = embed_dim
-            self.scorer = SharedScorer(embed_dim, geometry)
+            self.scorer = SharedScorer(embed_dim, network.geometry)
         else:
             self.project_context = nn.Linear(n_uavs * embed_dim, embed_dim)
-            self.feed_forward = nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
+            self.feed_forward = feed_forward(embed_dim, network.ff_dim)
 
-    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
+    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> AllocatorCache:
         if self.n_uavs is not None:
-            return Cache(nodes)
-        projected = self.scorer.project_task(nodes)
-        return Cache(nodes, (projected, *FleetGeometry.of(static)) if self.geometry else (projected,))
+            return AllocatorCache(nodes)
+        return AllocatorCache(nodes, self.scorer.project_task(nodes), FleetGeometry.of(static) if self.geometry else None)
 
-    def fleet_geometry(self, cache: Cache) -> FleetGeometry | None:
-        """
-        :param cache: Of ``batch`` instances
-        :return: Their measures; None if the scorer is not told any
-        """
-        return FleetGeometry(*cache.projections[1:]) if self.geometry else None
-
-    def observed_state(self, cache: Cache, observation: TensorDict) -> AllocatorState:
+    def observed_state(self, cache: AllocatorCache, observation: TensorDict) -> AllocatorState:
         assignment, current_task = observation["assignment"], observation["current_task"].long().squeeze(-1)
         n_tasks = assignment.shape[-1]
         task, uavs = (
             current_task.clamp(max=n_tasks - 1),
             th.arange(observation["action_mask"].shape[-1], device=cache.nodes.device),
         )
-        geometry, fleet, features = self.fleet_geometry(cache), None, None
+        geometry, fleet, features = cache.geometry, None, None
         final = assignment.gather(1, current_task.argmax(1)[:, None, None].expand(-1, 1, n_tasks))
         decided = th.arange(n_tasks, device=assignment.device) < current_task[..., None]
         if assignment.shape[1] > 1 and (assignment == final.where(decided, UNASSIGNED)).all():
@@ -199,12 +184,11 @@ class AllocatorExtractor(EpisodicExtractor):
         depot = cache.nodes[:, 0]
         return depot[:, None, None].repeat(1, n_samples, n_uavs, 1)
 
-    def decode(self, cache: Cache, state: AllocatorState) -> th.Tensor:
+    def decode(self, cache: AllocatorCache, state: AllocatorState) -> th.Tensor:
         node = (state.task + 1)[..., None]
         task_embedding = cache.nodes.gather(1, node.expand(-1, -1, cache.nodes.shape[-1]))
-        if self.n_uavs is None:
-            projected = cache.projections[0]
-            task = projected.gather(1, node.expand(-1, -1, projected.shape[-1]))
+        if cache.scorer_nodes is not None:
+            task = cache.scorer_nodes.gather(1, node.expand(-1, -1, SCORER_DIM))
             return th.cat([self.scorer(state.context, task, state.features), task_embedding], dim=-1)
         subset_embedding = self.feed_forward(self.project_context(state.context.flatten(2)))
         return th.cat([subset_embedding, task_embedding], dim=-1)
@@ -244,8 +228,7 @@ class AllocatorPolicy(EpisodicPolicy):
     @property
     def sweep(self) -> bool:
         """Whether the tasks should be swept around the depot."""
-        given = self._own_parameters["sweep"]
-        return PRESETS[self._own_parameters["preset"]]["sweep"] if given is None else given
+        return self.settings.sweep
 
     @property
     def env_order(self) -> str:
@@ -290,13 +273,13 @@ class AllocatorPolicy(EpisodicPolicy):
             )
 
     def _decode_episodes(
-        self, instances: Instances, cache: Cache, n_samples: int, deterministic: bool, generator: th.Generator | None
+        self, instances: Instances, cache: AllocatorCache, n_samples: int, deterministic: bool, generator: th.Generator | None
     ) -> th.Tensor:
         self.check_fleet(instances)
         n_uavs, n_tasks = instances.n_uavs, instances.n_tasks
         context = self.features_extractor.initial_context(cache, n_samples, n_uavs)
         batch_size, embed_dim = len(instances), cache.nodes.shape[-1]
-        geometry = self.features_extractor.fleet_geometry(cache)
+        geometry = cache.geometry
         fleet = None if geometry is None else geometry.initial(n_samples, n_uavs)
         uavs = th.arange(n_uavs, device=instances.device)
         actions = th.full((batch_size, n_samples, n_tasks), UNASSIGNED, device=instances.device)
@@ -315,13 +298,15 @@ class AllocatorPolicy(EpisodicPolicy):
                 fleet = geometry.add(fleet, step, action[..., None] == uavs)
         return actions.masked_fill(~instances.task_mask[:, None], UNASSIGNED)
 
-    def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[AllocatorState, th.Tensor]:
+    def _episode_states(
+        self, instances: Instances, cache: AllocatorCache, actions: th.Tensor
+    ) -> tuple[AllocatorState, th.Tensor]:
         self.check_fleet(instances)
         batch_size, n_samples, n_tasks = actions.shape
         mine = actions[..., None] == th.arange(instances.n_uavs, device=actions.device)
         context = self.features_extractor.running_context(cache, mine)[:, :, :-1].flatten(1, 2)
         task = th.arange(n_tasks, device=actions.device).expand(batch_size, n_samples, n_tasks).flatten(1)
-        geometry = self.features_extractor.fleet_geometry(cache)
+        geometry = cache.geometry
         features = None
         if geometry is not None:
             fleet = FleetState(*(field[:, :, :-1].flatten(1, 2) for field in geometry.of_prefixes(mine)))

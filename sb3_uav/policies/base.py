@@ -9,7 +9,8 @@ SB3's step loop reaches them through :meth:`EpisodicPolicy._decode_observation`;
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import asdict
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -17,87 +18,18 @@ from gymnasium import spaces
 from sb3_contrib.common.maskable.distributions import MaskableDistribution
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import STATIC_KEYS
-from sb3_uav.policies.encoder import AttentionEncoder, StaticObservation
-from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
+from sb3_uav.policies.extractor import Cache, EpisodicExtractor
+from sb3_uav.policies.grouping import EPISODE_INDEX
 from sb3_uav.policies.memory import rows_that_fit
+from sb3_uav.policies.settings import NetworkSettings
+from sb3_uav.policies.static_observation import StaticObservation
 
-# The settings of the networks, by preset; arguments of the policy override them one by one.
-PRESETS: dict[str, dict[str, Any]] = {
-    # One network for every number of tasks and UAVs and every maximum flight distance.
-    "default": dict(
-        embed_dim=64,
-        n_layers=3,
-        n_heads=4,
-        ff_dim=256,
-        normalization="instance",
-        use_values=True,
-        relative=True,
-        geometry=True,
-        bias_dim=32,
-        shared_scorer=True,
-        sweep=True,
-        mixed_precision=False,
-    ),
-    # Section IV-A2 of the paper.
-    "paper": dict(
-        embed_dim=128,
-        n_layers=3,
-        n_heads=8,
-        ff_dim=512,
-        normalization="batch",
-        use_values=False,
-        relative=False,
-        geometry=False,
-        bias_dim=32,
-        shared_scorer=False,
-        sweep=False,
-        mixed_precision=False,
-    ),
-}
-
-
-# Into how many times as many slots as there are transitions they may be sorted by instance, when some instances have many
-# transitions and others few; beyond, every transition gets a copy of its instance's encoding instead.
-MAX_FILLING = 4
-
-
-class Cache(NamedTuple):
-    """
-    What decoding needs of an encoded instance. Every tensor leads with the batch dimension.
-
-    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
-    :param projections: What a decoder precomputes from them, or nothing
-    """
-
-    nodes: th.Tensor
-    projections: tuple[th.Tensor, ...] = ()
-
-    def detach(self) -> Cache:
-        return Cache(self.nodes.detach(), tuple(projection.detach() for projection in self.projections))
-
-    def rows(self, rows: th.Tensor) -> Cache:
-        """
-        :param rows: ``(n,)`` int64
-        :return: The encodings of these instances, in this order
-        """
-        return Cache(self.nodes[rows], tuple(projection[rows] for projection in self.projections))
-
-    def update_rows(self, rows: th.Tensor, fresh: Cache) -> Cache:
-        """
-        :param rows: ``(n,)`` int64
-        :param fresh: A cache of ``n`` instances to put into these rows
-        """
-        return Cache(
-            self.nodes.index_copy(0, rows, fresh.nodes),
-            tuple(old.index_copy(0, rows, new) for old, new in zip(self.projections, fresh.projections, strict=True)),
-        )
+SelfPolicy = TypeVar("SelfPolicy", bound="EpisodicPolicy")
 
 
 class EpisodeEvaluation(NamedTuple):
@@ -112,151 +44,6 @@ class EpisodeEvaluation(NamedTuple):
     log_prob: th.Tensor
     values: th.Tensor
     entropy: th.Tensor
-
-
-class EpisodicExtractor(BaseFeaturesExtractor):
-    """
-    An attention encoder and the part of the decoder before the action distribution, as an SB3 features extractor.
-
-    In evaluation mode and without gradients it keeps the encodings of the last batch and encodes only rows whose static part
-    has changed: once per episode instead of once per step. Training mode, loading parameters and moving to another device
-    clear that cache; so must whoever changes parameters in another way (:meth:`clear_cache`).
-
-    With gradients it encodes every instance of a minibatch once, however many transitions it has there. An episode rollout
-    buffer says which transitions belong together (key ``episode_index``, int64, beside static parts that stand once per
-    episode); with SB3's own buffers it looks for equal rows itself. ``use_cache`` and ``share_encodings`` turn the two off.
-
-    :param observation_space: Of one of our environments
-    :param features_dim: Size of the features
-    :param encoder_kwargs: Arguments of :class:`~sb3_uav.policies.encoder.AttentionEncoder`
-    """
-
-    # Which environment it is for, and an observation key that only this one has.
-    environment: ClassVar[str]
-    own_key: ClassVar[str]
-    # Settings of a preset that mean nothing to this level.
-    foreign_settings: ClassVar[frozenset[str]] = frozenset()
-    # Size of what follows the logits in the features, if the features begin with the logits of the actions.
-    context_dim: int | None = None
-
-    def __init__(self, observation_space: spaces.Space, features_dim: int, **encoder_kwargs: Any) -> None:
-        super().__init__(observation_space, features_dim)
-        self.encoder = AttentionEncoder(**encoder_kwargs)
-        self.use_cache = True
-        self.share_encodings = True
-        self.n_encoded_rows = 0
-        self._cached: tuple[StaticObservation, Cache] | None = None
-
-    @classmethod
-    def n_actions(cls, observation_space: spaces.Space) -> int:
-        """
-        :param observation_space: What the extractor is to be made for
-        :return: Number of actions
-        :raises ValueError: If it is not that of this level's environment
-        """
-        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
-            raise ValueError(f"{cls.__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}.")
-        if cls.own_key not in observation_space.spaces:
-            raise ValueError(
-                f"{cls.__name__} needs the observation of a {cls.environment} environment, but its keys "
-                f"{sorted(observation_space.spaces)} lack {cls.own_key!r}; use the policy of the other level."
-            )
-        return int(observation_space["action_mask"].shape[0])  # type: ignore[index]
-
-    @abstractmethod
-    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
-        """
-        :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
-        :param static: What they were made from
-        :return: Everything that decoding needs
-        """
-
-    @abstractmethod
-    def observed_state(self, cache: Cache, observation: TensorDict) -> Any:
-        """
-        :param cache: Of ``batch`` instances
-        :param observation: The changing part of preprocessed observations, every key ``(batch, n_samples, ...)``
-        :return: The decoder's state
-        """
-
-    @abstractmethod
-    def decode(self, cache: Cache, state: Any) -> th.Tensor:
-        """
-        :param cache: Of ``batch`` instances
-        :param state: The decoder's state, ``(batch, n_samples, ...)``
-        :return: Features ``(batch, n_samples, features)``
-        """
-
-    def encode(self, static: StaticObservation) -> Cache:
-        """
-        :param static: ``batch`` instances
-        :return: Their encodings
-        """
-        self.n_encoded_rows += len(static.depot)
-        return self.precompute(self.encoder(static), static)
-
-    def forward(self, observations: TensorDict) -> th.Tensor:
-        """
-        :param observations: ``batch`` preprocessed observations; static keys have a row per episode where there is an
-            ``episode_index``
-        :return: ``(batch, features_dim)``
-        """
-        static = StaticObservation.from_observation(observations)
-        dynamic = {key: value for key, value in observations.items() if key not in STATIC_KEYS}
-        index = dynamic.pop(EPISODE_INDEX, None)
-        if index is None and th.is_grad_enabled() and self.share_encodings:
-            static, index = static.unique()
-        if index is None:
-            return self._decode_each(self._encode_cached(static), dynamic)
-        grouping = Grouping.by_instance(index, len(static.depot))
-        cache = self.encode(static)
-        if grouping.source.numel() > MAX_FILLING * len(index):
-            return self._decode_each(cache.rows(index), dynamic)
-        state = self.observed_state(cache, {key: grouping.gather(value) for key, value in dynamic.items()})
-        return grouping.scatter(self.decode(cache, state))
-
-    def _decode_each(self, cache: Cache, dynamic: TensorDict) -> th.Tensor:
-        """:return: Features of one transition of every instance, ``(batch, features_dim)``"""
-        state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
-        return self.decode(cache, state)[:, 0]
-
-    def _encode_cached(self, static: StaticObservation) -> Cache:
-        if self.training or th.is_grad_enabled() or not self.use_cache:
-            return self.encode(static)
-        if self._cached is None or self._cached[0].tasks.shape != static.tasks.shape:
-            rows, cache = None, self.encode(static)
-        else:
-            known, cache = self._cached
-            changed = th.stack([(old != new).flatten(1).any(1) for old, new in zip(known, static, strict=True)]).any(0)
-            rows = changed.nonzero()[:, 0]
-            if len(rows) == len(changed):
-                cache = self.encode(static)
-            elif len(rows) > 0:
-                cache = cache.update_rows(rows, self.encode(static.rows(rows)))
-        if rows is None or len(rows) > 0:
-            # A copy, because an environment may write its next observation into the same memory.
-            self._cached = (StaticObservation(*(field.clone() for field in static)), cache)
-        return cache
-
-    def clear_cache(self) -> None:
-        """Forget the kept encodings."""
-        self._cached = None
-
-    def train(self, mode: bool = True) -> EpisodicExtractor:
-        if mode:
-            self.clear_cache()
-        return super().train(mode)
-
-    def _apply(self, *args: Any, **kwargs: Any) -> EpisodicExtractor:
-        self.clear_cache()
-        return super()._apply(*args, **kwargs)
-
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        self.clear_cache()
-        super()._load_from_state_dict(*args, **kwargs)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cached": None}
 
 
 def sample_actions(logits: th.Tensor, deterministic: bool, generator: th.Generator | None) -> th.Tensor:
@@ -286,24 +73,15 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     :param action_space: Of the same environment
     :param lr_schedule: Learning rate schedule (could be constant)
     :param preset: ``"default"``, or ``"paper"`` for the network of the paper
-    :param embed_dim: Size of the embeddings; the preset's when None, like the next eleven
-    :param n_layers: Number of attention layers
-    :param n_heads: Number of heads
-    :param ff_dim: Hidden size of the feed-forward sublayers
-    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
-    :param use_values: Whether task values are features of the encoder
-    :param relative: Whether networks see coordinates relative to the depot in units of the maximum flight distance
-    :param geometry: Whether decoders are told distances, slack and loads (the allocator needs ``shared_scorer`` for that)
-    :param bias_dim: Hidden size of what the router makes of them
-    :param shared_scorer: Whether one scorer judges all UAVs of the allocator, so that it serves fleets of any size
-    :param sweep: Whether the allocator wants the tasks in the order of :func:`~sb3_uav.envs.sweep.sweep_order`
-    :param mixed_precision: Whether encoders and the router's bias compute in bfloat16 where that is safe
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
     :param activation_fn: Activation function of ``net_arch``
     :param ortho_init: Whether to use SB3's orthogonal initialization
     :param use_sde: Must be False; stock PPO and A2C pass it
     :param optimizer_class: The optimizer to use
     :param optimizer_kwargs: Additional keyword arguments of the optimizer
+    :param settings: Fields of :class:`~sb3_uav.policies.settings.NetworkSettings` that override the preset's
+    :raises TypeError: If there is no such setting
+    :raises ValueError: If an argument is not allowed
     """
 
     extractor_class: ClassVar[type[EpisodicExtractor]]
@@ -315,46 +93,18 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         action_space: spaces.Space,
         lr_schedule: Schedule,
         preset: str = "default",
-        embed_dim: int | None = None,
-        n_layers: int | None = None,
-        n_heads: int | None = None,
-        ff_dim: int | None = None,
-        normalization: str | None = None,
-        use_values: bool | None = None,
-        relative: bool | None = None,
-        geometry: bool | None = None,
-        bias_dim: int | None = None,
-        shared_scorer: bool | None = None,
-        sweep: bool | None = None,
-        mixed_precision: bool | None = None,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = False,
         use_sde: bool = False,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
+        **settings: Any,
     ) -> None:
         if use_sde:
             raise ValueError("use_sde must be False: state-dependent exploration is for continuous actions.")
-        if preset not in PRESETS:
-            raise ValueError(f"preset is {preset!r}; choose one of {sorted(PRESETS)}.")
-        given = dict(
-            embed_dim=embed_dim,
-            n_layers=n_layers,
-            n_heads=n_heads,
-            ff_dim=ff_dim,
-            normalization=normalization,
-            use_values=use_values,
-            relative=relative,
-            geometry=geometry,
-            bias_dim=bias_dim,
-            shared_scorer=shared_scorer,
-            sweep=sweep,
-            mixed_precision=mixed_precision,
-        )
-        self._own_parameters: dict[str, Any] = {"preset": preset, **given}
-        settings = {**PRESETS[preset], **{key: value for key, value in given.items() if value is not None}}
-        own_settings = {key: settings[key] for key in settings.keys() - self.extractor_class.foreign_settings}
+        self.settings = NetworkSettings.of(settings, preset)
+        self._own_parameters: dict[str, Any] = {"preset": preset, **settings}
         super().__init__(
             observation_space,
             action_space,
@@ -363,7 +113,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
             activation_fn=activation_fn,
             ortho_init=ortho_init,
             features_extractor_class=self.extractor_class,
-            features_extractor_kwargs=own_settings,
+            features_extractor_kwargs=asdict(self.settings),
             normalize_images=False,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -384,6 +134,17 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :param n_actions: Number of actions where the network is bound to it
         :return: Observation space, action space
         """
+
+    def untrained_copy(self: SelfPolicy, seed: int) -> SelfPolicy:
+        """
+        :param seed: Seed for the initial parameters; torch's global random state stays as it is
+        :return: A policy of the same architecture with new parameters, on the same device, in evaluation mode
+        """
+        with th.random.fork_rng(devices=[]):
+            th.default_generator.manual_seed(seed)
+            fresh = type(self)(**self._get_constructor_parameters())
+        fresh.set_training_mode(False)
+        return fresh.to(self.device)
 
     def rows_that_fit(self, n_nodes: int, n_subsets: int = 0) -> int:
         """
@@ -457,12 +218,12 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
 
     @abstractmethod
     def _decode_episodes(
-        self, instances: Instances, cache: Cache, n_samples: int, deterministic: bool, generator: th.Generator | None
+        self, instances: Instances, cache: Any, n_samples: int, deterministic: bool, generator: th.Generator | None
     ) -> th.Tensor:
         """The level's part of :meth:`decode_episodes`."""
 
     @abstractmethod
-    def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[Any, th.Tensor]:
+    def _episode_states(self, instances: Instances, cache: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
         """
         The decoder's states before every action of complete episodes.
 

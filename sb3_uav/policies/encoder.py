@@ -3,76 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch as th
-from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 from torch.nn import functional
 
-from sb3_uav.envs.instances import Instances
-from sb3_uav.policies.geometry import N_NODE_FEATURES, node_features, scaled_coordinates
+from sb3_uav.policies.geometry import NodeFeature, node_features, scaled_coordinates
+from sb3_uav.policies.settings import NetworkSettings
+from sb3_uav.policies.static_observation import StaticObservation
 
 # The strongest preference for near nodes that a head starts with: e^-1 at 1/16 of the maximum flight distance.
 LOCALITY = 256.0
-NORMALIZATIONS = ("instance", "batch", "layer", "none")
-
-
-class StaticObservation(NamedTuple):
-    """
-    What an episode keeps, float32 on the network's device.
-
-    :param depot: ``(batch, 2)``
-    :param tasks: ``(batch, n_tasks, 2)``
-    :param values: ``(batch, n_tasks)``
-    :param task_mask: ``(batch, n_tasks)`` bool, True for real tasks
-    :param max_distance: ``(batch, 1)``
-    """
-
-    depot: th.Tensor
-    tasks: th.Tensor
-    values: th.Tensor
-    task_mask: th.Tensor
-    max_distance: th.Tensor
-
-    @classmethod
-    def from_observation(cls, observation: TensorDict) -> StaticObservation:
-        """:param observation: A batch of preprocessed observations"""
-        return cls(
-            depot=observation["depot"],
-            tasks=observation["tasks"].view(len(observation["tasks"]), -1, 2),
-            values=observation["task_values"],
-            task_mask=observation["task_mask"].bool(),
-            max_distance=observation["max_distance"],
-        )
-
-    def rows(self, rows: th.Tensor) -> StaticObservation:
-        """
-        :param rows: ``(n,)`` int64
-        :return: These rows, in this order
-        """
-        return StaticObservation(*(field[rows] for field in self))
-
-    def unique(self) -> tuple[StaticObservation, th.Tensor]:
-        """
-        :return: The different rows, and which of them every row is, ``(batch,)`` int64
-        """
-        flat = th.cat([field.flatten(1).float() for field in self], dim=1)
-        different, index = flat.unique(dim=0, return_inverse=True)
-        # Any row of each kind; index_copy with repeated targets keeps one of them.
-        row = th.arange(len(index), device=index.device)
-        return self.rows(index.new_zeros(len(different)).index_copy(0, index, row)), index
-
-    @classmethod
-    def from_instances(cls, instances: Instances) -> StaticObservation:
-        """:param instances: Instances on the network's device"""
-        return cls(
-            depot=instances.depot.float(),
-            tasks=instances.tasks.float(),
-            values=instances.values.float(),
-            task_mask=instances.task_mask,
-            max_distance=instances.max_distance.float()[:, None],
-        )
+# Keeps the division by the standard deviation finite; the value of torch's own normalizations.
+NORM_EPSILON = 1e-5
+# Logarithm of about 55: the number of tasks whose feature is 0, in the middle of the sizes in use.
+TYPICAL_LOG_TASKS = 4.0
 
 
 class InstanceNorm(nn.Module):
@@ -104,7 +49,7 @@ class InstanceNorm(nn.Module):
             count = real.sum(1, keepdim=True)
             centred = nodes - nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
             variance = (centred**2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-        return centred * ((variance + 1e-5).rsqrt() * self.weight) + self.bias
+        return centred * ((variance + NORM_EPSILON).rsqrt() * self.weight) + self.bias
 
 
 class NodeNorm(nn.Module):
@@ -121,8 +66,6 @@ class NodeNorm(nn.Module):
 
     def __init__(self, kind: str, embed_dim: int) -> None:
         super().__init__()
-        if kind not in NORMALIZATIONS:
-            raise ValueError(f"normalization is {kind!r}; choose one of {NORMALIZATIONS}.")
         self.norm: nn.Module = nn.Identity()
         if kind == "instance":
             self.norm = InstanceNorm(embed_dim)
@@ -157,8 +100,6 @@ class SelfAttention(nn.Module):
 
     def __init__(self, embed_dim: int, n_heads: int, relative: bool = False) -> None:
         super().__init__()
-        if embed_dim % n_heads != 0:
-            raise ValueError(f"embed_dim {embed_dim} must be a multiple of n_heads {n_heads}.")
         self.n_heads = n_heads
         # From heads that look everywhere to heads that look nearby.
         slopes = LOCALITY ** th.linspace(0.0, 1.0, n_heads)
@@ -231,23 +172,28 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     return fused_attention(query, key, value, attention_bias).transpose(1, 2).flatten(2)
 
 
+def feed_forward(embed_dim: int, ff_dim: int) -> nn.Sequential:
+    """
+    :param embed_dim: Size of input and output
+    :param ff_dim: Hidden size
+    :return: A linear layer, ReLU and a second linear layer (the paper's FF)
+    """
+    return nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
+
+
 class AttentionLayer(nn.Module):
     """
     Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (14), (15)).
 
-    :param embed_dim: Size of the embeddings
-    :param n_heads: Number of heads
-    :param ff_dim: Hidden size of the feed-forward sublayer
-    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
-    :param relative: Whether attention prefers near nodes
+    :param settings: Shape of the network
     """
 
-    def __init__(self, embed_dim: int, n_heads: int, ff_dim: int, normalization: str, relative: bool = False) -> None:
+    def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
-        self.attention = SelfAttention(embed_dim, n_heads, relative)
-        self.attention_norm = NodeNorm(normalization, embed_dim)
-        self.feed_forward = nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
-        self.feed_forward_norm = NodeNorm(normalization, embed_dim)
+        self.attention = SelfAttention(settings.embed_dim, settings.n_heads, settings.relative)
+        self.attention_norm = NodeNorm(settings.normalization, settings.embed_dim)
+        self.feed_forward = feed_forward(settings.embed_dim, settings.ff_dim)
+        self.feed_forward_norm = NodeNorm(settings.normalization, settings.embed_dim)
 
     def forward(
         self,
@@ -271,38 +217,18 @@ class AttentionEncoder(nn.Module):
     """
     Embeds depot and tasks.
 
-    :param embed_dim: Size of the embeddings
-    :param n_layers: Number of attention layers
-    :param n_heads: Number of heads
-    :param ff_dim: Hidden size of the feed-forward sublayers
-    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
-    :param use_values: Whether the value of a task is a feature beside its coordinates (the paper's tasks are all worth 1)
-    :param relative: Whether to see coordinates relative to the depot in units of the maximum flight distance, with distances,
-        directions and densities beside them, instead of plain ones
-    :param mixed_precision: Whether to compute in bfloat16 where that is safe
+    :param settings: Shape of the network
     """
 
-    def __init__(
-        self,
-        embed_dim: int = 128,
-        n_layers: int = 3,
-        n_heads: int = 8,
-        ff_dim: int = 512,
-        normalization: str = "instance",
-        use_values: bool = True,
-        relative: bool = False,
-        mixed_precision: bool = False,
-    ) -> None:
+    def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
-        self.use_values = use_values
-        self.relative = relative
-        self.mixed_precision = mixed_precision
-        # Relative to itself the depot lies nowhere in particular; what matters is how many tasks there are.
-        self.embed_depot = nn.Linear(1 if relative else 2, embed_dim)
-        self.embed_task = nn.Linear((N_NODE_FEATURES if relative else 2) + use_values, embed_dim)
-        self.layers = nn.ModuleList(
-            AttentionLayer(embed_dim, n_heads, ff_dim, normalization, relative) for _ in range(n_layers)
-        )
+        self.use_values = settings.use_values
+        self.relative = settings.relative
+        self.mixed_precision = settings.mixed_precision
+        # Relative to itself the depot has no position; what matters is how many tasks there are.
+        self.embed_depot = nn.Linear(1 if self.relative else 2, settings.embed_dim)
+        self.embed_task = nn.Linear((len(NodeFeature) if self.relative else 2) + self.use_values, settings.embed_dim)
+        self.layers = nn.ModuleList(AttentionLayer(settings) for _ in range(settings.n_layers))
 
     def forward(self, static: StaticObservation) -> th.Tensor:
         """
@@ -312,7 +238,7 @@ class AttentionEncoder(nn.Module):
         depot, features, coordinates = static.depot, static.tasks, None
         if self.relative:
             coordinates = scaled_coordinates(static)
-            depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - 4.0
+            depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - TYPICAL_LOG_TASKS
             features = node_features(coordinates, static.task_mask)
         if self.use_values:
             features = th.cat([features, static.values[..., None]], dim=-1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -14,16 +15,42 @@ from torch.nn import functional
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value
-from sb3_uav.policies.base import Cache, EpisodicExtractor, EpisodicPolicy, sample_actions
-from sb3_uav.policies.encoder import StaticObservation, attend
-from sb3_uav.policies.geometry import N_MOVE_FEATURES, MoveGeometry
+from sb3_uav.policies.base import EpisodicPolicy, sample_actions
+from sb3_uav.policies.encoder import attend
+from sb3_uav.policies.extractor import Cache, EpisodicExtractor
+from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
+from sb3_uav.policies.settings import NetworkSettings
+from sb3_uav.policies.static_observation import StaticObservation
 
 # Logits are clipped to +-10 (paper, equation of u; Bello et al.).
 LOGIT_CLIP = 10.0
-# How steeply the geometric bias prefers near tasks before training.
-NEAREST_FIRST = 4.0
+# What the compatibilities get from the geometry of a move before training: twice as far away is 2^4 times less likely. Tours
+# then begin as those of a randomized nearest neighbor search.
+INITIAL_SCORE = {MoveFeature.RELATIVE_DISTANCE: -4.0}
 # Into how many chunks by size subsets are cut before they are padded.
 SIZE_CLASSES = 2
+
+
+@dataclass(frozen=True)
+class RouterCache(Cache):
+    """
+    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
+    :param graph: ``(batch, 1, embed_dim)``, the instance's part of every query
+    :param glimpse_key: ``(batch, n_tasks + 1, embed_dim)``
+    :param glimpse_value: ``(batch, n_tasks + 1, embed_dim)``
+    :param logit_key: ``(batch, n_tasks + 1, embed_dim)``
+    :param unit: ``(batch, 1)``, the unit of the remaining distance
+    :param bias_nodes: ``(batch, n_tasks + 1, bias_dim)``, the nodes' part of the move bias; None without ``geometry``
+    :param geometry: Measures of the instances; None without ``geometry``
+    """
+
+    graph: th.Tensor
+    glimpse_key: th.Tensor
+    glimpse_value: th.Tensor
+    logit_key: th.Tensor
+    unit: th.Tensor
+    bias_nodes: th.Tensor | None
+    geometry: MoveGeometry | None
 
 
 class RouterState(NamedTuple):
@@ -42,7 +69,7 @@ class MoveBias(nn.Module):
     """
     What the geometry of a move, together with the embeddings, adds to its scores.
 
-    It starts as a preference for near tasks: twice as far away is ``2**NEAREST_FIRST`` times less likely.
+    The last score is that of the compatibilities. It starts as a preference for near tasks, see :data:`INITIAL_SCORE`.
 
     :param embed_dim: Size of the embeddings
     :param bias_dim: Hidden size
@@ -53,19 +80,20 @@ class MoveBias(nn.Module):
     def __init__(self, embed_dim: int, bias_dim: int, n_scores: int, mixed_precision: bool = False) -> None:
         super().__init__()
         self.mixed_precision = mixed_precision
-        self.linear = nn.Linear(N_MOVE_FEATURES, n_scores)
-        self.project_features = nn.Linear(N_MOVE_FEATURES, bias_dim)
+        self.linear = nn.Linear(len(MoveFeature), n_scores)
+        self.project_features = nn.Linear(len(MoveFeature), bias_dim)
         self.project_node = nn.Linear(embed_dim, bias_dim, bias=False)
         self.project_query = nn.Linear(embed_dim, bias_dim, bias=False)
         self.score = nn.Linear(bias_dim, n_scores)
         for parameter in (*self.linear.parameters(), *self.score.parameters()):
             nn.init.zeros_(parameter)
         with th.no_grad():
-            self.linear.weight[-1, 1] = -NEAREST_FIRST
+            for feature, weight in INITIAL_SCORE.items():
+                self.linear.weight[-1, feature] = weight
 
     def forward(self, features: th.Tensor, nodes: th.Tensor, query: th.Tensor) -> th.Tensor:
         """
-        :param features: ``(batch, n_samples, n_nodes, N_MOVE_FEATURES)``
+        :param features: ``(batch, n_samples, n_nodes, len(MoveFeature))``
         :param nodes: ``(batch, n_nodes, bias_dim)``, the projected nodes
         :param query: ``(batch, n_samples, embed_dim)``, where the UAV is and what it can still fly
         :return: ``(batch, n_samples, n_nodes, n_scores)``
@@ -84,89 +112,67 @@ class RouterExtractor(EpisodicExtractor):
 
     The compatibilities are the logits of :class:`RouterPolicy`; other policies may build on the features as they like.
 
-    :param observation_space: Of a ``RoutePlanning`` environment
-    :param embed_dim: Size of the embeddings
-    :param n_layers: Number of attention layers
-    :param n_heads: Number of heads
-    :param ff_dim: Hidden size of the feed-forward sublayers
-    :param normalization: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
-    :param use_values: Whether task values are features of the encoder
-    :param relative: Whether the encoder sees scaled coordinates relative to the depot
-    :param geometry: Whether distances and slack add a learned bias to the scores of the glimpse and to the compatibilities
-    :param bias_dim: Hidden size of what computes that bias
-    :param mixed_precision: Whether the encoder and the bias compute in bfloat16
+    :param observation_space: Observation space of a ``RoutePlanning`` environment
+    :param settings: Fields of :class:`~sb3_uav.policies.settings.NetworkSettings`
+    :raises TypeError: If there is no such setting
+    :raises ValueError: If a setting or the observation space is not allowed
     """
 
     environment = "RoutePlanning"
     own_key = "position"
-    foreign_settings = frozenset({"shared_scorer", "sweep"})
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        embed_dim: int = 128,
-        n_layers: int = 3,
-        n_heads: int = 8,
-        ff_dim: int = 512,
-        normalization: str = "instance",
-        use_values: bool = True,
-        relative: bool = False,
-        geometry: bool = False,
-        bias_dim: int = 32,
-        mixed_precision: bool = False,
-    ) -> None:
-        super().__init__(
-            observation_space,
-            self.n_actions(observation_space) + embed_dim,
-            embed_dim=embed_dim,
-            n_layers=n_layers,
-            n_heads=n_heads,
-            ff_dim=ff_dim,
-            normalization=normalization,
-            use_values=use_values,
-            relative=relative,
-            mixed_precision=mixed_precision,
-        )
+    def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
+        network = NetworkSettings.of(settings)
+        embed_dim, n_heads = network.embed_dim, network.n_heads
+        super().__init__(observation_space, self.n_actions(observation_space) + embed_dim, network)
         self.embed_dim = self.context_dim = embed_dim
         self.n_heads = n_heads
         self.project_graph = nn.Linear(embed_dim, embed_dim, bias=False)
         self.project_step = nn.Linear(embed_dim + 1, embed_dim, bias=False)
         self.project_nodes = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_glimpse = nn.Linear(embed_dim, embed_dim, bias=False)
-        self.scaled = relative or geometry
-        self.move_bias = MoveBias(embed_dim, bias_dim, n_heads + 1, mixed_precision) if geometry else None
+        self.scaled = network.relative or network.geometry
+        # One score for each head of the glimpse and one for the compatibilities.
+        self.move_bias = (
+            MoveBias(embed_dim, network.bias_dim, n_heads + 1, network.mixed_precision) if network.geometry else None
+        )
 
-    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Cache:
+    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> RouterCache:
         real = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)[..., None]
         graph = nodes.masked_fill(~real, 0.0).sum(1) / real.sum(1)
         glimpse_key, glimpse_value, logit_key = self.project_nodes(nodes).chunk(3, dim=-1)
-        # What the remaining distance is measured in.
-        unit = static.max_distance if self.scaled else th.ones_like(static.max_distance)
-        geometry = () if self.move_bias is None else (self.move_bias.project_node(nodes), *MoveGeometry.of(static))
-        return Cache(nodes, (self.project_graph(graph)[:, None], glimpse_key, glimpse_value, logit_key, unit, *geometry))
+        return RouterCache(
+            nodes=nodes,
+            graph=self.project_graph(graph)[:, None],
+            glimpse_key=glimpse_key,
+            glimpse_value=glimpse_value,
+            logit_key=logit_key,
+            unit=static.max_distance if self.scaled else th.ones_like(static.max_distance),
+            bias_nodes=None if self.move_bias is None else self.move_bias.project_node(nodes),
+            geometry=None if self.move_bias is None else MoveGeometry.of(static),
+        )
 
-    def observed_state(self, cache: Cache, observation: TensorDict) -> RouterState:
+    def observed_state(self, cache: RouterCache, observation: TensorDict) -> RouterState:
         return RouterState(
             observation["position"].long().squeeze(-1),
             observation["remaining_distance"].squeeze(-1),
             observation["action_mask"].bool(),
         )
 
-    def decode(self, cache: Cache, state: RouterState) -> th.Tensor:
-        graph, glimpse_key, glimpse_value, logit_key, unit, *rest = cache.projections
+    def decode(self, cache: RouterCache, state: RouterState) -> th.Tensor:
         here = cache.nodes.gather(1, state.position[..., None].expand(-1, -1, self.embed_dim))
-        remaining = state.remaining_distance / unit
+        remaining = state.remaining_distance / cache.unit
         glimpse_bias = th.zeros_like(state.action_mask, dtype=here.dtype)[:, None]
         logit_bias = glimpse_bias[:, 0]
-        query = graph + self.project_step(th.cat([here, remaining[..., None]], dim=-1))
-        if self.move_bias is not None:
-            features = MoveGeometry(*rest[1:]).features(state.position, remaining, state.action_mask)
-            bias = self.move_bias(features, rest[0], query).movedim(-1, 1)
+        query = cache.graph + self.project_step(th.cat([here, remaining[..., None]], dim=-1))
+        if self.move_bias is not None and cache.geometry is not None:
+            features = cache.geometry.features(state.position, remaining, state.action_mask)
+            bias = self.move_bias(features, cache.bias_nodes, query).movedim(-1, 1)
             glimpse_bias, logit_bias = bias[:, :-1], bias[:, -1]
         attention_bias = glimpse_bias.masked_fill(~state.action_mask[:, None], -th.inf)
-        heads = attend(query, glimpse_key, glimpse_value, self.n_heads, attention_bias)
+        heads = attend(query, cache.glimpse_key, cache.glimpse_value, self.n_heads, attention_bias)
         glimpse = self.project_glimpse(heads)
-        compatibility = glimpse @ logit_key.transpose(1, 2) / math.sqrt(self.embed_dim)
+        compatibility = glimpse @ cache.logit_key.transpose(1, 2) / math.sqrt(self.embed_dim)
         return th.cat([LOGIT_CLIP * compatibility.tanh() + logit_bias, glimpse], dim=-1)
 
 
@@ -192,7 +198,7 @@ class RouterPolicy(EpisodicPolicy):
         return RouterState(state.position, remaining.float(), state.action_mask)
 
     def _decode_episodes(
-        self, instances: Instances, cache: Cache, n_samples: int, deterministic: bool, generator: th.Generator | None
+        self, instances: Instances, cache: RouterCache, n_samples: int, deterministic: bool, generator: th.Generator | None
     ) -> th.Tensor:
         dynamics = RoutingDynamics(instances)
         state = dynamics.reset(n_samples)
@@ -204,7 +210,7 @@ class RouterPolicy(EpisodicPolicy):
             state, _ = dynamics.step(state, action)
         return th.stack(actions, dim=-1)
 
-    def _episode_states(self, instances: Instances, cache: Cache, actions: th.Tensor) -> tuple[RouterState, th.Tensor]:
+    def _episode_states(self, instances: Instances, cache: RouterCache, actions: th.Tensor) -> tuple[RouterState, th.Tensor]:
         dynamics = RoutingDynamics(instances)
         state = dynamics.reset(actions.shape[1])
         states = []

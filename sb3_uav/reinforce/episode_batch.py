@@ -11,7 +11,7 @@ import torch as th
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.policies.base import Cache
+from sb3_uav.policies.extractor import Cache
 
 
 class EpisodeBatch(NamedTuple):

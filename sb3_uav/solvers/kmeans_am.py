@@ -14,7 +14,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.solvers.heuristics import checked_restarts, kmeans
+from sb3_uav.solvers.kmeans import checked_restarts, kmeans
 from sb3_uav.solvers.network_solver import BatchedSolver, parameters_hash
 
 

@@ -11,7 +11,8 @@ from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.heuristics import checked_restarts, kmeans, nearest_feasible_schedule
+from sb3_uav.solvers.kmeans import checked_restarts, kmeans
+from sb3_uav.solvers.nearest_task import nearest_feasible_schedule
 
 
 class KMeansVND(OneByOneSolver):

@@ -6,10 +6,7 @@ import math
 import time
 
 from sb3_uav.solvers.base import OneByOneSolver
-
-
-class UnavailableError(ValueError):
-    """A solver that cannot be made here or in this time, though its options are right; others may be."""
+from sb3_uav.solvers.unavailable import UnavailableError
 
 
 class TimeLimitError(UnavailableError):

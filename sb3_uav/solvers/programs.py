@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_uav.common.optional import require
-from sb3_uav.solvers.limits import UnavailableError
+from sb3_uav.solvers.unavailable import UnavailableError
 
 # What the solvers are asked to keep to: in constraints, in integers, and between the best value and its bound.
 SOLVER_TOLERANCE = 1e-9

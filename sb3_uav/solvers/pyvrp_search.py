@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_uav.common.optional import require
+from sb3_uav.common.optional import install_command, require
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
@@ -94,7 +94,7 @@ def _require_pyvrp(solver: str) -> Any:
     if not found.startswith(SUPPORTED_VERSION):
         raise ImportError(
             f"Solver {solver} needs PyVRP 0.14, which needs Python 3.11 or newer; found PyVRP {found}. "
-            "Run: pip install 'sb3-uav[solvers]'"
+            f"Run: {install_command('solvers')}"
         )
     return pyvrp
 

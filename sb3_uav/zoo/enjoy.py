@@ -1,4 +1,4 @@
-"""``python -m sb3_uav.zoo.enjoy``: rl_zoo3's replay, with the router that was trained beside the allocator."""
+"""``sb3-uav enjoy`` or ``python -m sb3_uav.zoo.enjoy``: rl_zoo3's replay, with the router trained beside the allocator."""
 
 from __future__ import annotations
 
@@ -9,28 +9,24 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
+from sb3_uav.common.errors import main_function
+
+PROG = "sb3-uav enjoy"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def enjoy(arguments: Sequence[str]) -> None:
     """
     Replay a trained agent; every flag of ``rl_zoo3.enjoy`` works.
 
-    :param argv: Command line arguments; those of the process when None
-    :return: Exit code
+    :param arguments: Command line arguments
+    :raises ValueError: If there is no such agent, or another argument is wrong
+    :raises OSError: If a file cannot be read or written
+    :raises ImportError: If a package that replays need is not installed
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    try:
-        return _enjoy(arguments)
-    except (ValueError, AssertionError, FileNotFoundError, ImportError) as error:
-        print(f"sb3_uav.zoo.enjoy: {error}", file=sys.stderr)
-        return 2
-
-
-def _enjoy(arguments: list[str]) -> int:
-    from sb3_uav.zoo.experiment import ExperimentManager, make_batched_vec_env, register_algorithms, rl_zoo3
+    from sb3_uav.zoo.experiment import make_batched_vec_env, register_algorithms
+    from sb3_uav.zoo.rl_zoo3_compat import command_line, default_vec_env, replay_environment
 
     register_algorithms()
     import rl_zoo3.enjoy
@@ -48,21 +44,20 @@ def _enjoy(arguments: list[str]) -> int:
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
     router, model = None, None
-    if not known.help:
-        which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
-        _, model, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
-        router = find_router(Path(run_folder), known.load_best)
-        if router is not None and (known.load_checkpoint is not None or known.load_last_checkpoint):
-            print("Checkpoints of the zoo hold no router: rewards come from the run's last one.")
-
-    with (
-        # A plain function would become a method of the class that it is set on.
-        patch.object(ExperimentManager, "default_vec_env_cls", staticmethod(make_batched_vec_env)),
-        patch.object(rl_zoo3.enjoy, "create_test_env", partial(_create_test_env, create_test_env, model, router)),
-        patch.object(sys, "argv", ["sb3_uav.zoo.enjoy", "--algo", known.algo, "-f", known.folder, *arguments]),
-    ):
-        rl_zoo3.enjoy.enjoy()
-    return 0
+    try:
+        if not known.help:
+            which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
+            _, model, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
+            router = find_router(Path(run_folder), known.load_best)
+            if router is not None and (known.load_checkpoint is not None or known.load_last_checkpoint):
+                print("Checkpoints of the zoo hold no router: rewards come from the run's last one.")
+        make_env = partial(_create_test_env, create_test_env, model, router)
+        flags = ["--algo", known.algo, "-f", known.folder, *arguments]
+        with default_vec_env(make_batched_vec_env), replay_environment(make_env), command_line(PROG, flags):
+            rl_zoo3.enjoy.enjoy()
+    except AssertionError as error:
+        # What rl_zoo3 raises for a missing folder.
+        raise ValueError(str(error)) from error
 
 
 def find_router(run_folder: Path, best: bool) -> Path | None:
@@ -90,6 +85,9 @@ def _create_test_env(create_test_env: Any, model: str | None, router: Path | Non
         print(f"Rewards come from the router {router}")
     return env
 
+
+# For ``python -m sb3_uav.zoo.enjoy``, with exit codes in place of exceptions.
+main = main_function(PROG, enjoy)
 
 if __name__ == "__main__":
     sys.exit(main())

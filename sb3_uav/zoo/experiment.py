@@ -2,74 +2,32 @@
 
 from __future__ import annotations
 
-import difflib
-import inspect
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import yaml
-
-try:
-    import optuna
-    import rl_zoo3
-    import rl_zoo3.train
-    from rl_zoo3.exp_manager import ExperimentManager
-except ImportError as error:
-    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
-
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-import sb3_uav
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.zoo.configs import check_keys, parse_schedule, plain_numbers
+from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
-# What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
-ZOO_KEYS = {
-    "n_envs",
-    "n_timesteps",
-    "normalize",
-    "env_wrapper",
-    "vec_env_wrapper",
-    "callback",
-    "env_kwargs",
-    "monitor_kwargs",
-    "frame_stack",
-    "noise_type",
-    "noise_std",
-}
 
 
 def register_algorithms() -> None:
-    """Make our algorithms known to rl_zoo3; train, enjoy and the experiment manager share this dict."""
-    rl_zoo3.ALGOS.update(OUR_ALGORITHMS)
-
-
-def default_config(algo: str, env_id: str | None = None) -> Path | None:
-    """
-    :param algo: Name of an algorithm
-    :param env_id: What to train on
-    :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none, or if rl_zoo3 has
-        one and ours does not know this environment
-    """
-    package = Path(sb3_uav.__file__).parent
-    candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
-    ours = next((path for path in candidates if path.is_file()), None)
-    theirs = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
-    if ours is not None and env_id is not None and theirs.is_file() and env_id not in yaml.safe_load(ours.read_text()):
-        return None
-    return ours
+    """Add our algorithms to those of rl_zoo3."""
+    add_algorithms(OUR_ALGORITHMS)
 
 
 def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:
@@ -87,7 +45,8 @@ def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:
 
 class UAVExperimentManager(ExperimentManager):
     """
-    rl_zoo3's experiment manager, with our vectorized environment and without these traps of rl_zoo3 2.9.2:
+    rl_zoo3's experiment manager, with our vectorized environment and without these traps of rl_zoo3 2.9.2
+    (https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/exp_manager.py):
 
     - ``env_kwargs`` of a YAML reach the evaluation environment too;
     - ``const_X`` is a constant, and numbers that YAML reads as strings (``1e-3``) are numbers;
@@ -221,51 +180,3 @@ def find_checkpoint(trained_agent: Path) -> Path:
     if (below / STATE_FILE).is_file():
         return below
     raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which knows its router.")
-
-
-def plain_numbers(value: Any) -> Any:
-    """
-    :param value: From a YAML file
-    :return: The same with numbers for texts such as ``1e-3``, which YAML 1.1 does not take for numbers
-    """
-    if isinstance(value, dict):
-        return {key: plain_numbers(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [plain_numbers(item) for item in value]
-    if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d*)?[eE][+-]?\d+", value):
-        number = float(value)
-        return int(number) if number.is_integer() else number
-    return value
-
-
-def check_keys(found: set[str], algorithm: type, where: str) -> None:
-    """
-    :param found: Keys of a YAML entry
-    :param algorithm: The class that gets what rl_zoo3 does not take
-    :param where: File and entry, named in the error
-    :raises ValueError: On a key that neither knows
-    """
-    known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
-    for key in sorted(found - known):
-        nearest = difflib.get_close_matches(key, known, n=1)
-        advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."
-        raise ValueError(f"{where}: unknown key {key!r}; {advice}")
-
-
-def parse_schedule(key: str, text: str) -> float | LinearSchedule:
-    """
-    :param key: Name of the hyperparameter
-    :param text: ``lin_X``, ``const_X`` or a number
-    :return: A linear decay from X to 0, or a number
-    :raises ValueError: If it is neither, or a schedule where SB3 takes none
-    """
-    kind, _, number = text.rpartition("_")
-    try:
-        value = float(number)
-    except ValueError:
-        raise ValueError(f"{key} is {text!r}; write a number, lin_X or const_X.") from None
-    if kind in ("", "const"):
-        return value
-    if kind != "lin" or key == "ent_coef":
-        raise ValueError(f"{key} is {text!r}; write a number{'' if key == 'ent_coef' else ', lin_X or const_X'}.")
-    return LinearSchedule(start=value, end=0.0, end_fraction=1.0)

@@ -1,4 +1,4 @@
-"""``python -m sb3_uav.zoo.train``: rl_zoo3's training, knowing our algorithms, environments and YAMLs."""
+"""``sb3-uav train`` or ``python -m sb3_uav.zoo.train``: rl_zoo3's training with our algorithms, environments and YAMLs."""
 
 from __future__ import annotations
 
@@ -6,31 +6,25 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from unittest.mock import patch
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
+from sb3_uav.common.errors import main_function
+
+PROG = "sb3-uav train"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def train(arguments: Sequence[str]) -> None:
     """
     Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works.
 
-    :param argv: Command line arguments; those of the process when None
-    :return: Exit code
+    :param arguments: Command line arguments
+    :raises ValueError: If an argument or the YAML is wrong
+    :raises OSError: If a file cannot be read or written
+    :raises ImportError: If a package that training needs is not installed
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    try:
-        return _train(arguments)
-    except (ValueError, FileNotFoundError, ImportError) as error:
-        print(f"sb3_uav.zoo.train: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"sb3_uav.zoo.train: could not write: {error}. Earlier files are intact.", file=sys.stderr)
-        return 2
-
-
-def _train(arguments: list[str]) -> int:
-    from sb3_uav.zoo.experiment import UAVExperimentManager, default_config, register_algorithms, rl_zoo3
+    from sb3_uav.zoo.configs import default_config
+    from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
+    from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, rl_zoo3
 
     register_algorithms()
     parser = argparse.ArgumentParser(add_help=False)
@@ -46,14 +40,17 @@ def _train(arguments: list[str]) -> int:
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
-    # rl_zoo3.train.train makes its manager by this name, reads sys.argv and takes no arguments.
-    with (
-        patch.object(rl_zoo3.train, "ExperimentManager", UAVExperimentManager),
-        patch.object(sys, "argv", ["sb3_uav.zoo.train", "--algo", known.algo, *defaults, *arguments]),
-    ):
-        rl_zoo3.train.train()
-    return 0
+    with experiment_manager(UAVExperimentManager), command_line(PROG, ["--algo", known.algo, *defaults, *arguments]):
+        try:
+            rl_zoo3.train.train()
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise OSError(f"could not write: {error}. Earlier files are intact.") from error
 
+
+# For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.
+main = main_function(PROG, train)
 
 if __name__ == "__main__":
     sys.exit(main())

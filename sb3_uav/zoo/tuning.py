@@ -37,16 +37,11 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
-from rl_zoo3.hyperparams_opt import (
-    HYPERPARAMS_CONVERTER,
-    HYPERPARAMS_SAMPLER,
-    convert_onpolicy_params,
-    sample_a2c_params,
-    sample_ppo_params,
-)
+from rl_zoo3.hyperparams_opt import convert_onpolicy_params, sample_a2c_params, sample_ppo_params
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_uav.envs.gym_env import ProblemEnv
+from sb3_uav.zoo.rl_zoo3_compat import set_search_space
 
 Params = dict[str, Any]
 Converter = Callable[[Params], Params]
@@ -166,10 +161,8 @@ def register_search_spaces(env_id: str) -> None:
 
     :param env_id: Id of a registered environment
     """
-    samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
-    converters: dict[str, Any] = HYPERPARAMS_CONVERTER
     for algo, (sampler, converter) in (OUR_SPACES if is_ours(env_id) else OTHER_SPACES).items():
-        samplers[algo], converters[algo] = sampler, converter
+        set_search_space(algo, sampler, converter)
 
 
 def is_ours(env_id: str) -> bool:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -15,7 +16,6 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training.subsets import SingleUavGenerator
 
 # What a YAML entry of ITSCallback's router overrides.
 RECIPE: dict[str, Any] = dict(
@@ -29,13 +29,21 @@ RECIPE: dict[str, Any] = dict(
 )
 
 
-class DividedSubsets(SingleUavGenerator):
+@dataclass(frozen=True)
+class DividedSubsets:
     """
     Single-UAV subsets of instances that are divided without an allocator: half of them at random, as an untrained one does,
     half into sectors around the depot, much as a trained one does.
 
     :param generator: Draws the instances of the fleet
     """
+
+    generator: InstanceGenerator
+    n_uavs: ClassVar[int] = 1
+
+    @property
+    def n_tasks(self) -> int:
+        return self.generator.n_tasks
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.training.fixed_set import RESULTS_FILE, EvaluationHistory
+from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory
 
 FINISHED_FILE = "finished.json"
 LOG_FILE = "train.log"
 
 
-class Training(NamedTuple):
+class ZooTraining(NamedTuple):
     """
     One run.
 
@@ -107,7 +107,7 @@ class Training(NamedTuple):
         return None
 
 
-def run_trainings(trainings: Sequence[Training], n_jobs: int) -> None:
+def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
     """
     Run trainings side by side. Whatever ends this function early ends its processes too.
 
@@ -116,7 +116,7 @@ def run_trainings(trainings: Sequence[Training], n_jobs: int) -> None:
     :raises ValueError: If some failed, after all others are through
     """
     waiting = list(trainings)
-    running: list[tuple[Training, subprocess.Popen[bytes], float]] = []
+    running: list[tuple[ZooTraining, subprocess.Popen[bytes], float]] = []
     failures: list[str] = []
     with termination_as_interrupt():
         try:

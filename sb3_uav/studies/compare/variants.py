@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from sb3_uav.zoo.experiment import default_config, plain_numbers
+from sb3_uav.zoo.configs import default_config, plain_numbers
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
 SHARED_SAMPLES = 8

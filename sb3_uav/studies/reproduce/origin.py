@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_uav.evaluation.results import describe_machine
-from sb3_uav.plots.figures import save_figure
+from sb3_uav.evaluation.provenance import describe_machine
+from sb3_uav.plots.figure_files import save_figure
 from sb3_uav.studies.reproduce.paper import paper_tables
 from sb3_uav.studies.reproduce.scales import Scale
 

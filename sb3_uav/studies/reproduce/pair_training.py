@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from sb3_uav.common.files import replaced_when_complete
-from sb3_uav.evaluation.results import describe_machine
+from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
 from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
 
@@ -30,7 +30,7 @@ class TrainingError(ValueError):
 
 
 @dataclass(frozen=True)
-class Job:
+class PairTraining:
     """
     One training.
 
@@ -89,7 +89,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     :return: The zoo's YAML entry of the scenario with the changes of the recipe
     :raises FileNotFoundError: If the zoo's YAML is missing
     """
-    from sb3_uav.zoo.experiment import default_config, plain_numbers
+    from sb3_uav.zoo.configs import default_config, plain_numbers
 
     config = default_config("reinforce")
     if config is None:
@@ -110,7 +110,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     return json.loads(json.dumps(entry))
 
 
-def train(job: Job) -> None:
+def train_pair(job: PairTraining) -> None:
     """
     Train a pair, or go on with an interrupted training, and put its zips where they belong.
 
@@ -139,7 +139,7 @@ def train(job: Job) -> None:
     _publish(job, run, state)
 
 
-def _run_zoo(job: Job, config: Path, interrupted: Path | None) -> None:
+def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     """
     :param job: The training
     :param config: Its YAML
@@ -147,7 +147,7 @@ def _run_zoo(job: Job, config: Path, interrupted: Path | None) -> None:
     :raises TrainingError: If it fails
     """
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
-    from sb3_uav.zoo import train as zoo
+    from sb3_uav.zoo import train as zoo_train
 
     arguments = ["--algo", "reinforce", "--env", job.env_id, "--conf-file", str(config), "--log-folder", str(job.run_folder)]
     arguments += ["--seed", str(job.seed), "--device", job.device, "--eval-freq", "-1", "--verbose", "0"]
@@ -158,13 +158,13 @@ def _run_zoo(job: Job, config: Path, interrupted: Path | None) -> None:
         arguments += ["--trained-agent", str(checkpoint / read_state(checkpoint)["allocator"])]
     output = job.run_folder / OUTPUT_FILE
     with output.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
-        code = zoo.main(arguments)
+        code = zoo_train.main(arguments)
     if code != 0:
         last = output.read_text(encoding="utf-8").strip().splitlines()[-1:]
         raise TrainingError(f"Training {job.title} failed: {''.join(last)} (all of its output is in {output})")
 
 
-def _publish(job: Job, run: Path, state: Mapping[str, Any]) -> None:
+def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     """
     Copy what a complete training left to the folder of models.
 
@@ -186,7 +186,7 @@ def _publish(job: Job, run: Path, state: Mapping[str, Any]) -> None:
     os.replace(temporary, job.model_folder)
 
 
-def check_complete(job: Job) -> bool:
+def check_complete(job: PairTraining) -> bool:
     """
     :param job: A training
     :return: Whether it is complete

@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import csv
-import multiprocessing
-import signal
-import sys
-import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from multiprocessing import connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple
 
 from sb3_uav.studies.reproduce.pair_training import (
     ALLOCATOR_FILE,
     ITS_LOG,
     ROUTER_FILE,
-    Job,
-    TrainingError,
+    PairTraining,
     check_complete,
-    train,
     training_entry,
 )
 from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.studies.reproduce.training_processes import train_pairs
 
 ITS, INDEPENDENT = "ITS", "independent"
 LEVELS = ("allocator", "router")
@@ -40,8 +30,6 @@ STRATEGY_FOLDERS = {
 }
 # What has to be in every line of a log.
 LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
-# Seconds between two looks at the logs of running trainings.
-POLL_INTERVAL = 1.0
 
 
 @dataclass(frozen=True)
@@ -156,7 +144,7 @@ class Models:
     ) -> dict[tuple[Scenario, str], Model]:
         """The user's own pairs, and those that are trained with a recipe; see :meth:`get`."""
         found: dict[tuple[Scenario, str], Model] = {}
-        jobs: dict[tuple[Scenario, str], Job] = {}
+        jobs: dict[tuple[Scenario, str], PairTraining] = {}
         for scenario, strategy in wanted:
             model = self._given(scenario, strategy)
             if model is not None and (model.its_log is not None or not log_needed):
@@ -191,9 +179,9 @@ class Models:
                 raise FileNotFoundError(f"{model.folder / missing}: no such file; --models needs both zips of a pair.")
         return None
 
-    def _job(self, recipe: Recipe, kind: str, scenario: Scenario, strategy: str) -> Job:
+    def _job(self, recipe: Recipe, kind: str, scenario: Scenario, strategy: str) -> PairTraining:
         place = Path(scenario.folder) / STRATEGY_FOLDERS[strategy]
-        return Job(
+        return PairTraining(
             scenario,
             strategy,
             training_entry(self.scale, recipe, scenario, strategy),
@@ -204,143 +192,11 @@ class Models:
             self.num_threads,
         )
 
-    def _trained(self, jobs: dict[tuple[Scenario, str], Job]) -> dict[tuple[Scenario, str], Model]:
+    def _trained(self, jobs: dict[tuple[Scenario, str], PairTraining]) -> dict[tuple[Scenario, str], Model]:
         """Those that are trained, after training what is missing."""
         todo = [job for job in jobs.values() if not check_complete(job)]
         if self.training:
-            run_trainings(todo, self.n_jobs)
+            train_pairs(todo, self.n_jobs)
             todo = []
         trained = {key: job for key, job in jobs.items() if job not in todo}
         return {k: Model(job.scenario, job.strategy, job.model_folder, job.scenario.name) for k, job in trained.items()}
-
-
-def run_trainings(jobs: Sequence[Job], n_jobs: int) -> None:
-    """
-    :param jobs: Trainings
-    :param n_jobs: How many of them to run at once, each in a process of its own if there are several
-    :raises TrainingError: If one fails; those that run are ended, and go on from their last epochs the next time
-    :raises KeyboardInterrupt: If one is interrupted
-    """
-    if n_jobs == 1 or len(jobs) < 2:
-        for position, job in enumerate(jobs):
-            with EpochLines([job], f"training {position + 1} of {len(jobs)}: ") as lines:
-                lines.print(f"{job.title}: begins")
-                train(job)
-        return
-    waiting = deque(jobs)
-    running: dict[int, _Training] = {}
-    try:
-        with EpochLines(jobs, f"{len(jobs)} trainings, {n_jobs} at once: ") as lines:
-            while waiting or running:
-                while waiting and len(running) < n_jobs:
-                    training = _Training.start(waiting.popleft())
-                    lines.print(f"{training.job.title}: begins")
-                    running[training.process.sentinel] = training
-                for sentinel in connection.wait(list(running)):
-                    assert isinstance(sentinel, int)
-                    running.pop(sentinel).check()
-    finally:
-        for training in running.values():
-            training.process.terminate()
-            training.process.join()
-
-
-class _Training(NamedTuple):
-    """
-    A training in a process of its own.
-
-    :param job: The training
-    :param process: The process
-    :param errors: Says what went wrong
-    """
-
-    job: Job
-    process: SpawnProcess
-    errors: connection.Connection
-
-    @classmethod
-    def start(cls, job: Job) -> _Training:
-        context = multiprocessing.get_context("spawn")
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_train_in_process, args=(job, sender), daemon=True)
-        process.start()
-        # The last end to be closed is the process's, so that its death ends the pipe.
-        sender.close()
-        return cls(job, process, receiver)
-
-    def check(self) -> None:
-        """
-        :raises TrainingError: If the training, which is over, failed
-        """
-        self.process.join()
-        if self.process.exitcode != 0:
-            try:
-                message = self.errors.recv()
-            except EOFError:
-                message = f"Training {self.job.title} failed: its process died; was it out of memory?"
-            raise TrainingError(message)
-
-
-def _train_in_process(job: Job, errors: connection.Connection) -> None:
-    # Ctrl-C reaches all processes of a terminal; the main one ends the others.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        train(job)
-    except Exception as error:
-        errors.send(str(error))
-        raise SystemExit(1) from error
-
-
-class EpochLines:
-    """
-    Prints a line for every epoch that ends while the ``with`` block lasts.
-
-    :param jobs: The trainings
-    :param prefix: What every line begins with
-    """
-
-    def __init__(self, jobs: Sequence[Job], prefix: str) -> None:
-        self.jobs = jobs
-        self.prefix = prefix
-        self._n_lines = {job.title: len(self._lines(job)) for job in jobs}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        # The trainings of this process send theirs into a file.
-        self._stream = sys.stderr
-
-    def __enter__(self) -> EpochLines:
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._over.wait(POLL_INTERVAL):
-            self._look()
-        self._look()
-
-    def _look(self) -> None:
-        for job in self.jobs:
-            lines = self._lines(job)
-            for line in lines[self._n_lines[job.title] :]:
-                epoch, level, phase, _, objective, seconds = line.split(",")[:6]
-                n_epochs = f" of {job.n_epochs[1]}" if level == "allocator" else ""
-                text = f"{level} epoch {epoch}{n_epochs} ({phase}): {float(objective):.2f} tasks, {float(seconds):.0f} s"
-                self.print(f"{job.title}: {text}")
-            self._n_lines[job.title] = len(lines)
-
-    @staticmethod
-    def _lines(job: Job) -> list[str]:
-        """The lines of the log of its newest run, without the header."""
-        from sb3_uav.training.epoch_log import LOG_FILE
-
-        logs = sorted(job.run_folder.glob(f"reinforce/*/{LOG_FILE}"), key=lambda log: log.stat().st_mtime)
-        return logs[-1].read_text(encoding="utf-8").splitlines()[1:] if logs else []
-
-    def print(self, text: str) -> None:
-        """
-        :param text: What else to say
-        """
-        print(self.prefix + text, file=self._stream, flush=True)

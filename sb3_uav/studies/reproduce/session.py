@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_uav.studies.reproduce.measurements import BASELINES, Evaluator
+from sb3_uav.studies.reproduce.evaluator import BASELINES, Evaluator
 from sb3_uav.studies.reproduce.origin import Origin, write_figure
 from sb3_uav.studies.reproduce.pairs import Models
 from sb3_uav.studies.reproduce.scales import Scale, Scenario
-from sb3_uav.studies.reproduce.table_files import Table, write_table
+from sb3_uav.studies.reproduce.table_formats import Table, write_table
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_uav.studies.reproduce.scales import SCALES
+from sb3_uav.studies.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
 
 if TYPE_CHECKING:
     from sb3_uav.studies.reproduce.session import Session
 
-TARGETS = ("table1", "table2", "table3", "table4", "fig3", "fig4", "fig5", "fig6", "fig7")
-DEFAULT_SOLVERS = ("milp", "ortools", "kmeans-vnd", "kmeans-am")
 EPILOG = """\
 what is written:
   DIR/table1.md, .tex, .csv       the table, the paper's figures beside ours; the same for the data of figures
@@ -88,29 +87,6 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def target_functions() -> dict[str, Callable[[Session], list[Path]]]:
-    """:return: What makes the tables and figures, by their names"""
-    from sb3_uav.studies.reproduce import figures, tables
-
-    modules = (tables, figures)
-    return {name: getattr(modules[0] if name.startswith("table") else modules[1], name) for name in TARGETS}
-
-
-def check_solvers(names: Sequence[str]) -> None:
-    """
-    :param names: Of ``--solvers``
-    :raises ValueError: If one is not the name of a solver that needs no zips, or is given twice
-    """
-    from sb3_uav.solvers.base import SOLVERS
-
-    known = sorted(set(SOLVERS) - {"dl-drl", "dl-drl-i"})
-    for name in names:
-        if name not in known:
-            raise ValueError(f"--solvers: {name!r} is not one of {known}; trained pairs are always there.")
-        if names.count(name) > 1:
-            raise ValueError(f"--solvers names {name!r} twice.")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: Arguments; those of the process when None
@@ -159,7 +135,7 @@ def make_session(
     """
     import torch as th
 
-    from sb3_uav.studies.reproduce.measurements import Evaluator
+    from sb3_uav.studies.reproduce.evaluator import Evaluator
     from sb3_uav.studies.reproduce.origin import Origin
     from sb3_uav.studies.reproduce.pairs import Models
     from sb3_uav.studies.reproduce.session import Session
@@ -174,9 +150,3 @@ def make_session(
     )
     evaluator = Evaluator(scale, out, args.seed, args.device, args.jobs, args.overwrite, progress)
     return Session(scale, models, evaluator, args.solvers, Origin(command, scale, args.seed), out)
-
-
-if __name__ == "__main__":
-    from sb3_uav.cli.main import main as command
-
-    sys.exit(command(["reproduce", *sys.argv[1:]]))

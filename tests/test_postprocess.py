@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import time
 from typing import Any
@@ -12,12 +13,13 @@ import pytest
 import torch as th
 from conftest import instance_batches
 from hypothesis import given, settings
-from test_solvers import make_pair, objectives, routes
+from solver_helpers import make_pair, objectives, routes
 
+from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.solvers import make_solver
-from sb3_uav.solvers.dl_drl import Block, Shortlists
+from sb3_uav.solvers.decoding import Decoder
 from sb3_uav.solvers.postprocess import Refinement, polish
 
 pytest.importorskip("numba")
@@ -28,6 +30,13 @@ def instances() -> Instances:
     return UniformGenerator(30, n_uavs=3)(4, np.random.default_rng(5))
 
 
+def test_repair_and_polish_find_more(instances: Instances) -> None:
+    """Untrained networks leave much to be found, also by repairing several samples instead of one."""
+    plain = objectives(make_pair(decode="sampling", samples=32), instances).sum()
+    repaired = objectives(make_pair(decode="sampling", samples=32, repair=True), instances).sum()
+    assert plain < repaired <= objectives(make_pair(repair=True, polish=0.3), instances).sum()
+
+
 @settings(max_examples=15)
 @given(instance_batches())
 def test_refined_schedules_of_any_instance_are_feasible_and_not_worse(batch: Instances) -> None:
@@ -35,13 +44,6 @@ def test_refined_schedules_of_any_instance_are_feasible_and_not_worse(batch: Ins
     repaired = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, repair=True), batch)
     polished = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, polish=0.004), batch)
     assert (repaired >= plain).all() and (polished >= plain).all()
-
-
-def test_repair_and_polish_find_more(instances: Instances) -> None:
-    """Untrained networks leave much to be found, also by repairing several samples instead of one."""
-    plain = objectives(make_pair(decode="sampling", samples=32), instances).sum()
-    repaired = objectives(make_pair(decode="sampling", samples=32, repair=True), instances).sum()
-    assert plain < repaired <= objectives(make_pair(repair=True, polish=0.3), instances).sum()
 
 
 def test_repair_is_repeatable(instances: Instances) -> None:
@@ -61,7 +63,7 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
     pair = make_pair(decode="sampling", samples=64, repair=True, polish=9.0)
     drawn: list[int] = []
     spent: list[float] = []
-    look = pair._look
+    look = Decoder.look
 
     def counting(*args: Any) -> Any:
         seen = look(*args)
@@ -78,7 +80,7 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
         return schedule
 
     clock.now = 0.0  # type: ignore[attr-defined]
-    monkeypatch.setattr(pair, "_look", counting)
+    monkeypatch.setattr(Decoder, "look", counting)
     monkeypatch.setattr("sb3_uav.solvers.postprocess.polish", noting)
     monkeypatch.setattr(time, "perf_counter", clock)
     pair.solve(instances, time_limit=0.5)
@@ -118,7 +120,7 @@ def test_wrong_polish(seconds: float) -> None:
 def test_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "numba", None)
     assert not Refinement().is_wanted
-    with pytest.raises(ImportError, match=r"pip install 'sb3-uav\[solvers\]'"):
+    with pytest.raises(ImportError, match=re.escape(install_command("solvers"))):
         Refinement(repair=True)
 
 
@@ -128,30 +130,11 @@ def test_polish_without_pyvrp(instances: Instances, monkeypatch: pytest.MonkeyPa
     assert check_schedule(instances, 0, polish(instances[0], Schedule([]), 0.05)).objective > 0
 
 
-def test_shortlists_keep_the_best_and_the_first_of_equal_ones() -> None:
-    lists = Shortlists(1, 2)
-    tours = th.tensor([[[[0, -1]], [[1, -1]], [[1, -1]], [[2, 3]]]])
-    lists.add(Block(th.tensor([[1.0, 1.0, 1.0, 2.0]]), tours))
-    first = [schedule.routes for schedule in lists.schedules()[0]]
-    assert first == [((2, 3),), ((0,),)]
-    lists.add(Block(th.tensor([[1.0, 0.5]]), th.tensor([[[[4]], [[5]]]])))
-    assert [schedule.routes for schedule in lists.schedules()[0]] == first
-    lists.add(Block(th.tensor([[3.0]]), th.tensor([[[[6]]]])))
-    assert [schedule.routes for schedule in lists.schedules()[0]] == [((6,),), ((2, 3),)]
-
-
 def test_options_of_the_command_line(instances: Instances) -> None:
     """``repair=1`` as well as ``repair=true``, and the pair that comes with the package."""
     assert make_solver("dl-drl:repair=1,polish=0.5").settings() == make_solver("dl-drl:repair=true,polish=0.5").settings()
     assert make_solver("dl-drl:repair=0").settings() == make_solver("dl-drl").settings()
     assert objectives(make_solver("dl-drl"), instances).min() > 0
-
-
-def test_shortlists_hold_different_schedules() -> None:
-    lists = Shortlists(1, 3)
-    copies = th.zeros(1, 9, 1, 1, dtype=th.int64)
-    lists.add(Block(th.full((1, 10), 2.0), th.cat([copies, copies[:, :1] + 1], dim=1)))
-    assert [schedule.routes for schedule in lists.schedules()[0]] == [((0,),), ((1,),)]
 
 
 def test_every_instance_has_its_share_of_the_time(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:

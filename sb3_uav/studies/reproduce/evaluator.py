@@ -12,9 +12,11 @@ import numpy as np
 from sb3_uav.common.random_streams import TEST_SEED
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
-from sb3_uav.evaluation.run import Progress, UnavailableSolver, evaluate
+from sb3_uav.evaluation.run import evaluate
+from sb3_uav.evaluation.set_evaluation import Progress
 from sb3_uav.evaluation.summary import SummaryRow
-from sb3_uav.solvers.base import Solver, make_solver
+from sb3_uav.solvers import Solver, make_solver
+from sb3_uav.solvers.unavailable import UnavailableSolver
 from sb3_uav.studies.reproduce.pairs import Model
 from sb3_uav.studies.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
 from sb3_uav.studies.reproduce.scales import Scale, Scenario

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_uav.common.files import replaced_when_complete
-from sb3_uav.envs.render import UAV_COLOURS, require_matplotlib
+from sb3_uav.envs.render import require_matplotlib
 from sb3_uav.envs.schedule import check_schedule
 from sb3_uav.evaluation.summary import gaps
-from sb3_uav.plots.figures import new_figure
+from sb3_uav.plots.figure_files import new_figure
 from sb3_uav.plots.schedule_map import MapPanel, schedules_figure
+from sb3_uav.plots.style import MARKERS, MAX_MARKERS, ORANGE, PURPLE, SERIES_COLORS, VERMILION, style_axes
 from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.measurements import complete
+from sb3_uav.studies.reproduce.evaluator import complete
 from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, LEVELS, Model, read_log
 from sb3_uav.studies.reproduce.paper import (
     ABLATION_FLEET,
@@ -29,11 +30,10 @@ from sb3_uav.studies.reproduce.paper import (
 )
 from sb3_uav.studies.reproduce.scales import Scenario, scenarios
 from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_files import Column, Table, best, number, to_csv
-from sb3_uav.studies.reproduce.tables import trained_pairs
+from sb3_uav.studies.reproduce.table_formats import Column, Table, best, number, to_csv
+from sb3_uav.studies.reproduce.tables_1_to_4 import trained_pairs
 
 MAPS_PER_LINE = 3
-MARKERS = ("o", "s", "^", "D", "v", "P")
 LEVEL_TITLES = {"allocator": "Upper level", "router": "Lower level"}
 STRATEGY_TITLES = {"ITS": "ITS (ours)"}
 CURVES_SUFFIX = "_curves.csv"
@@ -76,17 +76,8 @@ def read_curves(its_log: Path) -> dict[str, Curve]:
     return curves
 
 
-def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, fontsize=11, loc="left")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(axis="y", color="0.88", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
 def _shades(n: int) -> list[Any]:
-    """As many colours of one scale, for things that have an order."""
+    """As many colors of one scale, for things that have an order."""
     return [require_matplotlib().colormaps["viridis"](position) for position in np.linspace(0.0, 0.9, n)]
 
 
@@ -178,15 +169,15 @@ def _curves_table(caption: str, curves: Mapping[str, Mapping[str, Curve]], notes
 def _draw_fig4(curves: Mapping[Scenario, Mapping[str, Curve]]) -> Any:
     fleets = [n_uavs for n_uavs in FLEETS if any(scenario.n_uavs == n_uavs for scenario in curves)]
     figure = new_figure(5.5 * len(fleets), 7.0)
-    colours = dict(zip(SIZES, _shades(len(SIZES)), strict=True))
+    colors = dict(zip(SIZES, _shades(len(SIZES)), strict=True))
     grid = figure.subplots(len(LEVELS), len(fleets), squeeze=False)
     for line, level in zip(grid, LEVELS, strict=True):
         for axes, n_uavs in zip(line, fleets, strict=True):
-            _style(axes, f"U{n_uavs}: {LEVEL_TITLES[level].lower()}", "epoch", "cost")
+            style_axes(axes, f"U{n_uavs}: {LEVEL_TITLES[level].lower()}", "epoch", "cost")
             mine = {scenario: levels[level] for scenario, levels in curves.items() if scenario.n_uavs == n_uavs}
             for scenario, curve in mine.items():
                 epochs = np.arange(1, len(curve.cost) + 1)
-                look = {"color": colours[scenario.n_tasks], "label": scenario.name}
+                look = {"color": colors[scenario.n_tasks], "label": scenario.name}
                 axes.plot(epochs, curve.cost, linewidth=1.5, **look, **_markers(len(epochs), 0))
             n_pretraining = max((curve.n_pretraining for curve in mine.values()), default=0)
             if n_pretraining > 0:
@@ -198,7 +189,7 @@ def _draw_fig4(curves: Mapping[Scenario, Mapping[str, Curve]]) -> Any:
 
 def _markers(n_points: int, position: int) -> dict[str, Any]:
     """Markers where they do not hide the line."""
-    return {"marker": MARKERS[position % len(MARKERS)], "markersize": 4} if n_points <= 40 else {}
+    return {"marker": MARKERS[position % len(MARKERS)], "markersize": 4} if n_points <= MAX_MARKERS else {}
 
 
 # ----------------------------------------------------------------------------------------------------------------- Fig. 5
@@ -245,11 +236,11 @@ def fig5(session: Session) -> list[Path]:
 def _draw_fig5(curves: Mapping[str, Mapping[str, Curve]]) -> Any:
     figure = new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, sharey=True)
-    _style(left, "by epoch", "epoch of the upper level", "cost")
-    _style(right, "by training time", "minutes", "")
+    style_axes(left, "by epoch", "epoch of the upper level", "cost")
+    style_axes(right, "by training time", "minutes", "")
     for position, (strategy, levels) in enumerate(curves.items()):
         curve = levels["allocator"]
-        look = {"color": UAV_COLOURS[position], "linewidth": 1.5, "label": STRATEGY_TITLES.get(strategy, strategy)}
+        look = {"color": SERIES_COLORS[position], "linewidth": 1.5, "label": STRATEGY_TITLES.get(strategy, strategy)}
         look |= _markers(len(curve.cost), position)
         left.plot(np.arange(1, len(curve.cost) + 1), curve.cost, **look)
         right.plot(curve.minutes, curve.cost, **look)
@@ -346,12 +337,12 @@ def _baselines(
 def _draw_generalisation(objectives: Mapping[str, Mapping[int, float | None]], trained: Sequence[str]) -> Any:
     figure = new_figure(11.5, 4.6)
     left, right = figure.subplots(1, 2)
-    _style(left, "Objective", "problem", "tasks completed (mean)")
-    _style(right, "Gap to the best of these methods", "problem", "gap (%)")
+    style_axes(left, "Objective", "problem", "tasks completed (mean)")
+    style_axes(right, "Gap to the best of these methods", "problem", "gap (%)")
     values = np.array([[found.get(size) for size in SIZES] for found in objectives.values()], dtype=np.float64)
     shortfalls = np.array([gaps(column) for column in values.T.tolist()]).T
     shades = iter(_shades(len(trained)))
-    others = iter(("#D55E00", "#CC79A7", "#E69F00"))
+    others = iter((VERMILION, PURPLE, ORANGE))
     for position, method in enumerate(objectives):
         ours = method in trained
         look = {"color": next(shades) if ours else next(others), "linestyle": "-" if ours else (0, (4, 2))}

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from sb3_uav.evaluation.summary import SummaryRow, gaps
 from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.measurements import BASELINES, complete
+from sb3_uav.studies.reproduce.evaluator import BASELINES, complete
 from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, Model, read_log
 from sb3_uav.studies.reproduce.paper import (
     EXACT_BLOCK,
@@ -33,7 +33,7 @@ from sb3_uav.studies.reproduce.paper import (
 )
 from sb3_uav.studies.reproduce.scales import Scenario, scenarios
 from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_files import MISSING, Column, Table, best, number
+from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, best, number
 
 PAPER, OURS = "paper", "ours"
 FASTEST_SHOWN = 0.1

@@ -1,0 +1,7 @@
+"""``python -m sb3_uav.cli``: the command ``sb3-uav``."""
+
+import sys
+
+from sb3_uav.cli.main import main
+
+sys.exit(main())

@@ -1,0 +1,39 @@
+"""What every command does with an error: one line on the standard error and an exit code."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+OK, USER_ERROR, INTERRUPTED = 0, 2, 130
+
+
+def run_command(prog: str, function: Callable[[], int | None]) -> int:
+    """
+    Run a command and report its errors in one line, as argparse reports a wrong argument.
+
+    :param prog: Name of the command, which the line begins with
+    :param function: The command; None stands for the exit code 0
+    :return: Exit code: that of the command (0 on success), 2 if the input was wrong, 130 after Ctrl-C
+    """
+    try:
+        return function() or OK
+    except (ValueError, OSError, ImportError) as error:
+        print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:
+    """
+    :param prog: Name of a command
+    :param function: Takes its arguments
+    :return: Its main function, which takes the arguments of the process when they are None, and returns an exit code
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        return run_command(prog, lambda: function(list(sys.argv[1:] if argv is None else argv)))
+
+    return main

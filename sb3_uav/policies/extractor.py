@@ -1,0 +1,219 @@
+"""Feature extractors that encode an instance once and decode it many times."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TensorDict
+
+from sb3_uav.envs.problem import STATIC_KEYS
+from sb3_uav.policies.encoder import AttentionEncoder
+from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
+from sb3_uav.policies.settings import NetworkSettings
+from sb3_uav.policies.static_observation import StaticObservation
+
+CacheT = TypeVar("CacheT", bound="Cache")
+
+# Transitions are sorted by instance into a table with as many columns as the longest row needs. When that takes more than this
+# many slots per transition, every transition gets a copy of its instance's encoding instead.
+MAX_FILLING = 4
+
+
+@dataclass(frozen=True)
+class Cache:
+    """
+    The encodings of ``batch`` instances. Every tensor leads with the batch dimension; each level adds what its decoder
+    computes in advance: tensors, named tuples of tensors, or None.
+
+    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
+    """
+
+    nodes: th.Tensor
+
+    def detach(self: CacheT) -> CacheT:
+        """:return: The encodings without gradients"""
+        return self._map(th.Tensor.detach)
+
+    def rows(self: CacheT, rows: th.Tensor) -> CacheT:
+        """
+        :param rows: ``(n,)`` int64
+        :return: The encodings of these instances, in this order
+        """
+        return self._map(lambda field: field[rows])
+
+    def update_rows(self: CacheT, rows: th.Tensor, fresh: CacheT) -> CacheT:
+        """
+        :param rows: ``(n,)`` int64
+        :param fresh: A cache of ``n`` instances to put into these rows
+        :return: The encodings with these rows replaced
+        """
+        return self._map(lambda old, new: old.index_copy(0, rows, new), fresh)
+
+    def _map(self: CacheT, function: Callable[..., th.Tensor], *others: CacheT) -> CacheT:
+        """
+        :param function: Function of one tensor of this cache and the same one of each of the others
+        :param others: Caches of the same network
+        :return: A cache of the results
+        """
+        caches = (self, *others)
+        return type(self)(*(_map_tensors(function, *(getattr(cache, f.name) for cache in caches)) for f in fields(self)))
+
+
+def _map_tensors(function: Callable[..., th.Tensor], first: Any, *others: Any) -> Any:
+    """
+    :param function: Function of tensors
+    :param first: A tensor, a named tuple of tensors, or None
+    :param others: The same kind of thing
+    :return: The same kind of thing, with the results
+    """
+    if first is None or isinstance(first, th.Tensor):
+        return None if first is None else function(first, *others)
+    return type(first)(*(_map_tensors(function, *parts) for parts in zip(first, *others, strict=True)))
+
+
+class EpisodicExtractor(BaseFeaturesExtractor):
+    """
+    An attention encoder and the part of the decoder before the action distribution, as an SB3 features extractor.
+
+    In evaluation mode and without gradients it keeps the encodings of the last batch and encodes only rows whose static part
+    has changed: once per episode instead of once per step. Training mode, loading parameters and moving to another device
+    clear that cache; so must whoever changes parameters in another way (:meth:`clear_cache`).
+
+    With gradients it encodes every instance of a minibatch once, however many transitions it has there. An episode rollout
+    buffer says which transitions belong together (key ``episode_index``, int64, beside static parts that stand once per
+    episode); with SB3's own buffers it looks for equal rows itself. ``use_cache`` and ``share_encodings`` turn the two off.
+
+    :param observation_space: Observation space of one of our environments
+    :param features_dim: Size of the features
+    :param settings: What shapes the network
+    """
+
+    # Which environment it is for, and an observation key that only this one has.
+    environment: ClassVar[str]
+    own_key: ClassVar[str]
+    # Size of what follows the logits in the features, if the features begin with the logits of the actions.
+    context_dim: int | None = None
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int, settings: NetworkSettings) -> None:
+        super().__init__(observation_space, features_dim)
+        self.encoder = AttentionEncoder(settings)
+        self.use_cache = True
+        self.share_encodings = True
+        self.n_encoded_rows = 0
+        self._cached: tuple[StaticObservation, Any] | None = None
+
+    @classmethod
+    def n_actions(cls, observation_space: spaces.Space) -> int:
+        """
+        :param observation_space: Observation space that the extractor is to be made for
+        :return: Number of actions
+        :raises ValueError: If it is not that of this level's environment
+        """
+        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
+            raise ValueError(f"{cls.__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}.")
+        if cls.own_key not in observation_space.spaces:
+            raise ValueError(
+                f"{cls.__name__} needs the observation of a {cls.environment} environment, but its keys "
+                f"{sorted(observation_space.spaces)} lack {cls.own_key!r}; use the policy of the other level."
+            )
+        return int(observation_space["action_mask"].shape[0])  # type: ignore[index]
+
+    @abstractmethod
+    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Any:
+        """
+        :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
+        :param static: The observations they were made from
+        :return: Everything that decoding needs, the level's :class:`Cache`
+        """
+
+    @abstractmethod
+    def observed_state(self, cache: Any, observation: TensorDict) -> Any:
+        """
+        :param cache: Encodings of ``batch`` instances
+        :param observation: The changing part of preprocessed observations, every key ``(batch, n_samples, ...)``
+        :return: The decoder's state
+        """
+
+    @abstractmethod
+    def decode(self, cache: Any, state: Any) -> th.Tensor:
+        """
+        :param cache: Encodings of ``batch`` instances
+        :param state: The decoder's state, ``(batch, n_samples, ...)``
+        :return: Features ``(batch, n_samples, features)``
+        """
+
+    def encode(self, static: StaticObservation) -> Any:
+        """
+        :param static: ``batch`` instances
+        :return: Their encodings, the level's :class:`Cache`
+        """
+        self.n_encoded_rows += len(static.depot)
+        return self.precompute(self.encoder(static), static)
+
+    def forward(self, observations: TensorDict) -> th.Tensor:
+        """
+        :param observations: ``batch`` preprocessed observations; static keys have a row per episode where there is an
+            ``episode_index``
+        :return: ``(batch, features_dim)``
+        """
+        static = StaticObservation.from_observation(observations)
+        dynamic = {key: value for key, value in observations.items() if key not in STATIC_KEYS}
+        index = dynamic.pop(EPISODE_INDEX, None)
+        if index is None and th.is_grad_enabled() and self.share_encodings:
+            static, index = static.unique()
+        if index is None:
+            return self._decode_each(self._encode_cached(static), dynamic)
+        grouping = Grouping.by_instance(index, len(static.depot))
+        cache = self.encode(static)
+        if grouping.source.numel() > MAX_FILLING * len(index):
+            return self._decode_each(cache.rows(index), dynamic)
+        state = self.observed_state(cache, {key: grouping.gather(value) for key, value in dynamic.items()})
+        return grouping.scatter(self.decode(cache, state))
+
+    def _decode_each(self, cache: Cache, dynamic: TensorDict) -> th.Tensor:
+        """:return: Features of one transition of every instance, ``(batch, features_dim)``"""
+        state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
+        return self.decode(cache, state)[:, 0]
+
+    def _encode_cached(self, static: StaticObservation) -> Cache:
+        if self.training or th.is_grad_enabled() or not self.use_cache:
+            return self.encode(static)
+        if self._cached is None or self._cached[0].tasks.shape != static.tasks.shape:
+            rows, cache = None, self.encode(static)
+        else:
+            known, cache = self._cached
+            rows = known.changed_rows(static)
+            if len(rows) == len(static.depot):
+                cache = self.encode(static)
+            elif len(rows) > 0:
+                cache = cache.update_rows(rows, self.encode(static.rows(rows)))
+        if rows is None or len(rows) > 0:
+            # A copy, because an environment may write its next observation into the same memory.
+            self._cached = (static.clone(), cache)
+        return cache
+
+    def clear_cache(self) -> None:
+        """Forget the kept encodings."""
+        self._cached = None
+
+    def train(self, mode: bool = True) -> EpisodicExtractor:
+        if mode:
+            self.clear_cache()
+        return super().train(mode)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> EpisodicExtractor:
+        self.clear_cache()
+        return super()._apply(*args, **kwargs)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.clear_cache()
+        super()._load_from_state_dict(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cached": None}

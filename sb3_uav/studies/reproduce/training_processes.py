@@ -1,0 +1,91 @@
+"""Training several pairs, side by side in processes of their own if asked to."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing import connection
+from multiprocessing.context import SpawnProcess
+from typing import NamedTuple
+
+from sb3_uav.studies.reproduce.epoch_lines import EpochLines
+from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair
+
+
+def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
+    """
+    :param jobs: Trainings
+    :param n_jobs: How many of them to run at once, each in a process of its own if there are several
+    :raises TrainingError: If one fails; those that run are ended, and go on from their last epochs the next time
+    :raises KeyboardInterrupt: If one is interrupted
+    """
+    if n_jobs == 1 or len(jobs) < 2:
+        for position, job in enumerate(jobs):
+            with EpochLines([job], f"training {position + 1} of {len(jobs)}: ") as lines:
+                lines.print(f"{job.title}: begins")
+                train_pair(job)
+        return
+    waiting = deque(jobs)
+    running: dict[int, TrainingProcess] = {}
+    try:
+        with EpochLines(jobs, f"{len(jobs)} trainings, {n_jobs} at once: ") as lines:
+            while waiting or running:
+                while waiting and len(running) < n_jobs:
+                    training = TrainingProcess.start(waiting.popleft())
+                    lines.print(f"{training.job.title}: begins")
+                    running[training.process.sentinel] = training
+                for sentinel in connection.wait(list(running)):
+                    assert isinstance(sentinel, int)
+                    running.pop(sentinel).check()
+    finally:
+        for training in running.values():
+            training.process.terminate()
+            training.process.join()
+
+
+class TrainingProcess(NamedTuple):
+    """
+    A training in a process of its own.
+
+    :param job: The training
+    :param process: The process
+    :param errors: Says what went wrong
+    """
+
+    job: PairTraining
+    process: SpawnProcess
+    errors: connection.Connection
+
+    @classmethod
+    def start(cls, job: PairTraining) -> TrainingProcess:
+        context = multiprocessing.get_context("spawn")
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=train_in_process, args=(job, sender), daemon=True)
+        process.start()
+        # The last end to be closed is the process's, so that its death ends the pipe.
+        sender.close()
+        return cls(job, process, receiver)
+
+    def check(self) -> None:
+        """
+        :raises TrainingError: If the training, which is over, failed
+        """
+        self.process.join()
+        if self.process.exitcode != 0:
+            try:
+                message = self.errors.recv()
+            except EOFError:
+                message = f"Training {self.job.title} failed: its process died; was it out of memory?"
+            raise TrainingError(message)
+
+
+def train_in_process(job: PairTraining, errors: connection.Connection) -> None:
+    # Ctrl-C reaches all processes of a terminal; the main one ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        train_pair(job)
+    except Exception as error:
+        errors.send(str(error))
+        raise SystemExit(1) from error

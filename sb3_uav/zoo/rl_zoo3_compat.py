@@ -1,0 +1,144 @@
+"""
+Every place where we change rl_zoo3 from outside, each with the line of rl_zoo3 that makes it necessary.
+
+What we override in a subclass of its ``ExperimentManager`` stands in :mod:`sb3_uav.zoo.experiment`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+try:
+    import optuna  # noqa: F401  (rl_zoo3 imports it; a missing one is reported here too)
+    import rl_zoo3
+    import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+except ImportError as error:
+    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+MakeVecEnv = Callable[[list[Any]], VecEnv]
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """
+    :param owner: A module or class
+    :param name: Its attribute
+    :param value: The value of that attribute until the ``with`` block ends
+    """
+    before = owner.__dict__[name]
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+@contextmanager
+def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
+    """
+    Set what ``rl_zoo3.train`` and ``rl_zoo3.enjoy`` parse, which take no arguments.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``parser.parse_args()``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (the same)
+
+    :param prog: Name of the command
+    :param arguments: Its arguments
+    """
+    with _replaced(sys, "argv", [prog, *arguments]):
+        yield
+
+
+@contextmanager
+def experiment_manager(manager: type[ExperimentManager]) -> Iterator[None]:
+    """
+    Let ``rl_zoo3.train`` use another class, which it finds by this name in its module.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``exp_manager = ExperimentManager(``)
+
+    :param manager: The class
+    """
+    with _replaced(rl_zoo3.train, "ExperimentManager", manager):
+        yield
+
+
+@contextmanager
+def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
+    """
+    Let ``rl_zoo3.enjoy`` make its environment by another function, which it finds by this name in its module.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (``env = create_test_env(``)
+
+    :param make: Takes the arguments of ``rl_zoo3.utils.create_test_env``
+    """
+    import rl_zoo3.enjoy
+
+    with _replaced(rl_zoo3.enjoy, "create_test_env", make):
+        yield
+
+
+@contextmanager
+def default_vec_env(make: MakeVecEnv) -> Iterator[None]:
+    """
+    Let rl_zoo3 vectorize environments by another function while the ``with`` block lasts.
+
+    :param make: Takes one function per row
+    """
+    # A plain function would become a method of the class that it is set on.
+    with _replaced(ExperimentManager, "default_vec_env_cls", staticmethod(make)):
+        yield
+
+
+def set_default_vec_env(make: MakeVecEnv) -> None:
+    """
+    Let rl_zoo3 vectorize environments by another function from now on.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/exp_manager.py (``default_vec_env_cls``)
+
+    :param make: Takes one function per row
+    """
+    ExperimentManager.default_vec_env_cls = staticmethod(make)  # type: ignore[assignment]
+
+
+def add_algorithms(algorithms: dict[str, type[BaseAlgorithm]]) -> None:
+    """
+    Add to the algorithms of rl_zoo3; ``train``, ``enjoy`` and the experiment manager share one dict.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/utils.py (``ALGOS``)
+
+    :param algorithms: Classes by the names that ``--algo`` takes
+    """
+    rl_zoo3.ALGOS.update(algorithms)
+
+
+def set_search_space(algo: str, sampler: Callable[..., Any], converter: Callable[..., Any]) -> None:
+    """
+    Let ``-optimize`` search another space from now on.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/hyperparams_opt.py (``HYPERPARAMS_SAMPLER``)
+
+    :param algo: Name of an algorithm
+    :param sampler: Draws hyperparameters
+    :param converter: Converts what a trial drew
+    """
+    samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
+    converters: dict[str, Any] = HYPERPARAMS_CONVERTER
+    samplers[algo], converters[algo] = sampler, converter
+
+
+def stock_config(algo: str) -> Path:
+    """
+    https://github.com/DLR-RM/rl-baselines3-zoo/tree/master/hyperparams
+
+    :param algo: Name of an algorithm
+    :return: Where rl_zoo3 has its YAML, if it has one
+    """
+    return Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"

@@ -1,0 +1,151 @@
+"""MILP: exact, with a proven bound, and clear about sizes and licenses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from brute_force import largest_value
+from classical_helpers import ALL, objective, solved, tight_instances
+from conftest import instance_batches
+from hypothesis import given, settings
+
+from sb3_uav.envs import Instances, Schedule, UniformGenerator
+from sb3_uav.envs.reduction import ReducedInstance
+from sb3_uav.solvers import make_solver
+from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
+from sb3_uav.solvers.programs import FREE_LICENCE_SIZE, Answer, Backend
+from sb3_uav.solvers.unavailable import UnavailableError
+
+pytestmark = pytest.mark.usefixtures("ticks")
+
+# --------------------------------------------------------------------------------------------------------------- optimality
+
+
+def check_against_brute_force(instance: Instances) -> None:
+    best = largest_value(instance)
+    found, result = solved("milp", instance)
+    assert found == pytest.approx(best, rel=1e-7)
+    assert result.bound == pytest.approx(best, rel=1e-6) and result.bound is not None and result.bound >= found
+    for spec in ALL:
+        assert objective(spec, instance) <= best * (1 + 1e-12), spec
+
+
+@settings(max_examples=40)
+@given(tight_instances())
+def test_milp_is_optimal(instance: Instances) -> None:
+    """Brute force = MILP = its bound >= every other solver."""
+    check_against_brute_force(instance)
+
+
+@settings(max_examples=40)
+@given(instance_batches(max_tasks=6, max_batch=1))
+def test_milp_is_optimal_far_from_general_position(instance: Instances) -> None:
+    """Also for coincident and collinear tasks, tours of exactly the maximum length, and more UAVs than tasks."""
+    check_against_brute_force(instance)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- MILP
+
+
+@pytest.mark.parametrize("spec", ["milp", "milp:backend=gurobi"])
+def test_cycles_within_the_solvers_tolerance(spec: str) -> None:
+    """Two tasks so near to each other that (7) does not exclude a cycle of them alone: it is forbidden, and not counted."""
+    if "gurobi" in spec:
+        pytest.importorskip("gurobipy")
+    tasks = [[0.9, 0.0], [0.9, 1e-11], [-0.9, 0.0]]
+    found, result = solved(spec, Instances.from_arrays([0.0, 0.0], tasks, [0.4, 0.4, 1.0], 2.0, 1))
+    assert (found, result.bound) == pytest.approx((1.0, 1.0))
+
+
+class Pretender(Backend):
+    """
+    A backend that reports what it is told to, once per round.
+
+    :param answers: What it says
+    """
+
+    def __init__(self, *answers: Answer) -> None:
+        self.answers = list(answers)
+
+    def solve(self, program: Any, time_limit: float, threads: int, seed: int) -> Answer:
+        return self.answers.pop(0)
+
+
+def test_no_incumbent_gives_the_empty_schedule() -> None:
+    solver = MILP()
+    solver.backend = Pretender(Answer(None, math.inf))
+    instance = UniformGenerator(9, n_uavs=2)(1, np.random.default_rng(0))
+    found, result = solved(solver, instance)
+    assert found == 0 and result.schedule == Schedule([(), ()])
+    assert result.bound == int(instance.reachable().sum())
+
+
+def test_what_is_feasible_of_an_incumbent_is_kept() -> None:
+    """Of a tour and a cycle beside it, the tour stays when no time is left for another round."""
+    instance = Instances.from_arrays([0.0, 0.0], [[0.5, 0.0], [0.0, 0.7], [0.0, 0.8]], None, 2.0, 1)
+    # Arcs are (0, 1), (0, 2), (0, 3), (1, 0), (1, 2), (1, 3), (2, 0), (2, 1), (2, 3), (3, 0), (3, 1), (3, 2).
+    columns = np.array([1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1] + [1] * 3 + [0] * 3, dtype=float)
+    solver = MILP()
+    solver.backend = Pretender(Answer(columns, 3.0), Answer(None, 2.5))
+    found, result = solved(solver, instance)
+    assert (found, result.bound) == (1.0, 2.5)
+
+
+def test_the_time_limit_is_kept_and_the_bound_holds() -> None:
+    """Too large to be solved in a second; the bound is above what another solver finds."""
+    instance = UniformGenerator(30, n_uavs=3, max_distance=1.2)(1, np.random.default_rng(4))
+    _, result = solved("milp:time_limit=1", instance)
+    assert result.bound is not None and result.bound >= objective("ortools", instance)
+
+
+@pytest.mark.parametrize("n_tasks, n_uavs", [(1, 1), (1, 3), (4, 2), (7, 3), (30, 2), (20, 4), (16, 6)])
+def test_size_of_the_program(n_tasks: int, n_uavs: int) -> None:
+    reduced = ReducedInstance.of(UniformGenerator(n_tasks, n_uavs, max_distance=9.0)(1, np.random.default_rng(0)))
+    program = paper_program(Places.of(reduced), n_uavs)
+    assert program_size(n_tasks, n_uavs) == (len(program.objective), len(program.lower))
+    assert len(program.starts) == len(program.lower) + 1 == len(program.upper) + 1
+    assert program.starts[-1] == len(program.columns) == len(program.coefficients)
+
+
+@pytest.mark.parametrize("n_uavs, largest", [(2, 30), (4, 20), (6, 16)])
+def test_sizes_of_the_free_licence(n_uavs: int, largest: int) -> None:
+    assert max(program_size(largest, n_uavs)) <= FREE_LICENCE_SIZE < max(program_size(largest + 1, n_uavs))
+
+
+def test_too_large_for_any_machine() -> None:
+    instance = UniformGenerator(1500, 6, max_distance=9.0)(1, np.random.default_rng(0))
+    solver = make_solver("milp")
+    for action in (solver.check, solver.solve):
+        with pytest.raises(ValueError, match=r"13527000 variables and .* milp can have 2000000 of each.*use another solver"):
+            action(instance)
+
+
+def test_gurobi_and_its_licence() -> None:
+    """Both backends agree; beyond the free licence there is a clear message, before any solving and during it."""
+    gurobipy = pytest.importorskip("gurobipy")
+    solver: Any = make_solver("milp:backend=gurobi")
+    batch = UniformGenerator(7, n_uavs=2, max_distance=1.2)(4, np.random.default_rng(0))
+    for row in range(4):
+        (gurobi, result), (highs, _) = solved(solver, batch, row), solved("milp", batch, row)
+        assert gurobi == highs == pytest.approx(result.bound)
+    if solver.backend.size_limit != FREE_LICENCE_SIZE:
+        pytest.skip(f"gurobipy {gurobipy.gurobi.version()} has a full licence here")
+    large = Instances.concatenate([batch.pad(40), UniformGenerator(40, 2, max_distance=9.0)(1, np.random.default_rng(0))])
+    with pytest.raises(
+        ValueError, match=r"instance 4: the model has 3440 variables .* free licence admits.*milp:backend=highs"
+    ):
+        solver.check(large)
+    with pytest.raises(ValueError, match="free licence admits"):
+        solver.solve(large[4:])
+
+
+def test_gurobi_without_a_licence(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    pytest.importorskip("gurobipy")
+    licence = tmp_path / "gurobi.lic"
+    licence.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
+    monkeypatch.setenv("GRB_LICENSE_FILE", str(licence))
+    with pytest.raises(UnavailableError, match=r"Gurobi found no valid licence .* or use milp:backend=highs"):
+        make_solver("milp:backend=gurobi")
