@@ -22,7 +22,7 @@ from sb3_uav.plots.bands import Band, BandPanel, plot_bands, visible_range
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.training import fixed_set
-from sb3_uav.training.fixed_set import EvaluationHistory, FixedSetResult
+from sb3_uav.training.fixed_set_history import EvaluationHistory, FixedSetResult
 
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli

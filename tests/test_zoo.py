@@ -19,7 +19,8 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its import read_state
+from sb3_uav.training.callback_tree import siblings
+from sb3_uav.training.its_checkpoint import read_state
 
 pytest.importorskip("rl_zoo3")
 from tiny_zoo import ENV, EPOCH, its_with, run, write_config
@@ -184,7 +185,7 @@ class Spy(ITSCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        evaluations = self._siblings(type(self.locals["callback"].callbacks[-1]))
+        evaluations = siblings(self, type(self.locals["callback"].callbacks[-1]))
         environments = [self.training_env, evaluations[-1].eval_env]
         type(self).seen = [env.get_attr("problem")[0].generator.max_distance for env in environments]
 

@@ -19,7 +19,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.dl_drl import DLDRL
-from sb3_uav.training.its import LOG_FILE
+from sb3_uav.training.epoch_log import LOG_FILE
 
 
 def newest_run(folder: Path, env_id: str) -> Path:

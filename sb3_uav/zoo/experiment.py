@@ -16,7 +16,7 @@ from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
-from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces

@@ -17,7 +17,7 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.studies.compare.fixed_router import pretrain_router
 from sb3_uav.studies.compare.settings import Settings
 from sb3_uav.studies.compare.variants import router_settings
-from sb3_uav.training.fixed_set import draw_fixed_set, fingerprint
+from sb3_uav.training.fixed_set_returns import draw_fixed_set, fingerprint
 
 SETTINGS_FILE = "settings.json"
 VALIDATION_FILE = "validation.npz"

@@ -19,7 +19,7 @@ import sb3_uav
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.plots.bands import Band, BandPanel, plot_bands
-from sb3_uav.training.fixed_set import EvaluationHistory
+from sb3_uav.training.fixed_set_history import EvaluationHistory
 
 CSV_FILE = "evaluations.csv"
 REPORT_FILE = "report.md"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.training.fixed_set import RESULTS_FILE, EvaluationHistory
+from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory
 
 FINISHED_FILE = "finished.json"
 LOG_FILE = "train.log"

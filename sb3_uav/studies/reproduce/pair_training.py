@@ -35,7 +35,7 @@ class PairTraining:
     One training.
 
     :param scenario: The paper's name of the situation
-    :param strategy: One of :data:`~sb3_uav.training.its.STRATEGIES`
+    :param strategy: One of :data:`~sb3_uav.training.its_schedule.STRATEGIES`
     :param entry: The zoo's YAML entry
     :param run_folder: Where the zoo writes
     :param model_folder: Where the zips go when the training is complete
@@ -74,7 +74,7 @@ class PairTraining:
 
     def newest_run(self) -> Path | None:
         """:return: The zoo's folder of the latest run that has a checkpoint, if there is one"""
-        from sb3_uav.training.its import CHECKPOINT_FOLDER, STATE_FILE
+        from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 
         runs = [state.parents[1] for state in self.run_folder.glob(f"reinforce/*/{CHECKPOINT_FOLDER}/{STATE_FILE}")]
         return max(runs, key=lambda run: int(run.name.rpartition("_")[2]), default=None)
@@ -118,7 +118,7 @@ def train_pair(job: PairTraining) -> None:
     :raises TrainingError: If it fails; the message names the file with its output
     :raises KeyboardInterrupt: If it was interrupted
     """
-    from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+    from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
 
     job.run_folder.mkdir(parents=True, exist_ok=True)
     config = job.run_folder / CONFIG_FILE
@@ -146,7 +146,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     :param interrupted: The zoo's folder of the run to go on with
     :raises TrainingError: If it fails
     """
-    from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+    from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
     from sb3_uav.zoo import train as zoo_train
 
     arguments = ["--algo", "reinforce", "--env", job.env_id, "--conf-file", str(config), "--log-folder", str(job.run_folder)]
@@ -172,7 +172,8 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     :param run: The zoo's folder of the run
     :param state: Of its checkpoint
     """
-    from sb3_uav.training.its import CHECKPOINT_FOLDER, LOG_FILE
+    from sb3_uav.training.epoch_log import LOG_FILE
+    from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER
 
     temporary = job.model_folder.with_name(job.model_folder.name + ".tmp")
     shutil.rmtree(temporary, ignore_errors=True)
