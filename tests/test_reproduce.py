@@ -37,6 +37,7 @@ from sb3_uav.studies.reproduce.paper import (
 from sb3_uav.studies.reproduce.scales import SMOKE, Scenario, scenarios
 from sb3_uav.studies.reproduce.targets import TARGETS
 from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
 
 pytest.importorskip("rl_zoo3")
 
@@ -306,17 +307,14 @@ def job(folder: Path, strategy: str = ITS, **its: Any) -> PairTraining:
 @pytest.mark.slow
 def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: None) -> None:
     """With the same result as if it had not been interrupted."""
-    from sb3_uav.training import ITSCallback
 
-    end_epoch = ITSCallback._end_epoch
-
-    def interrupted(self: ITSCallback) -> None:
-        end_epoch(self)
-        if self.epoch == 2:
+    def interrupted(folder: Path, *args: Any) -> None:
+        write_checkpoint(folder, *args)
+        if read_state(folder)["epoch"] == 2:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ITSCallback, "_end_epoch", interrupted)
+        patch.setattr("sb3_uav.training.its.write_checkpoint", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train_pair(job(tmp_path))
     assert not (tmp_path / "models").exists()
