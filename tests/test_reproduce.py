@@ -272,7 +272,7 @@ def test_own_pairs(out: Path, tmp_path: Path, threads: None, capsys: pytest.Capt
     _, rows, comments = read_table(results / "fig3.csv")
     situations = [row["Situation"] for row in rows]
     assert situations == ["U4-80", "U4-100", *(scenario.name for scenario in scenarios() if scenario.n_uavs == 6)]
-    assert any("There is no pair for U4-500, and --no-training forbids to train one" in comment for comment in comments)
+    assert any("There is no pair for U4-500, and --no-training forbids training one" in comment for comment in comments)
     _, rows, comments = read_table(results / "fig7.csv")
     assert [row["Method"] for row in rows] == ["U6"]
     assert any("K-means+VND was not asked for" in comment for comment in comments)

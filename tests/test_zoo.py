@@ -33,7 +33,7 @@ from sb3_uav.zoo.configs import default_config, parse_schedule, plain_numbers
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of `python -m sb3_uav.zoo.train` in a process of its own; the folder above its logs."""
+    """A run of `python -m sb3_uav.zoo.train` in a separate process; the folder above its logs."""
     folder = tmp_path_factory.mktemp("zoo")
     config = write_config(folder)
     flags = ["--eval-freq", "160", "--eval-episodes", "4", "--save-freq", "320", "-tb", str(folder / "tb"), "--seed", "1"]

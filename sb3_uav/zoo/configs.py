@@ -1,4 +1,4 @@
-"""The zoo's YAML files: where they are, and what may stand in an entry."""
+"""The zoo's YAML files: finding, reading and checking them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 import sb3_uav
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
 
-# What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
+# Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
 ZOO_KEYS = {
     "n_envs",
     "n_timesteps",
@@ -56,9 +56,9 @@ def _kind(value: Any) -> str:
 def default_config(algo: str, env_id: str | None = None) -> Path | None:
     """
     :param algo: Name of an algorithm
-    :param env_id: What to train on
+    :param env_id: Id of an environment
     :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none, or if rl_zoo3 has
-        one and ours does not know this environment
+        one and ours has no entry for this environment
     """
     package = Path(sb3_uav.__file__).parent
     candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
@@ -71,7 +71,7 @@ def default_config(algo: str, env_id: str | None = None) -> Path | None:
 def plain_numbers(value: Any) -> Any:
     """
     :param value: From a YAML file
-    :return: The same with numbers for texts such as ``1e-3``, which YAML 1.1 does not take for numbers
+    :return: The value with numbers in place of strings such as ``1e-3``, which YAML 1.1 reads as strings
     """
     if isinstance(value, dict):
         return {key: plain_numbers(item) for key, item in value.items()}
@@ -86,9 +86,9 @@ def plain_numbers(value: Any) -> Any:
 def check_keys(found: set[str], algorithm: type, where: str) -> None:
     """
     :param found: Keys of a YAML entry
-    :param algorithm: The class that gets what rl_zoo3 does not take
+    :param algorithm: The class that receives the keys that rl_zoo3 does not use
     :param where: File and entry, named in the error
-    :raises ValueError: On a key that neither knows
+    :raises ValueError: If neither uses a key
     """
     known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
     for key in sorted(found - known, key=str):
@@ -99,7 +99,7 @@ def check_keys(found: set[str], algorithm: type, where: str) -> None:
 
 def check_values(entry: dict[str, Any], where: str) -> None:
     """
-    Check what rl_zoo3 would stumble over without saying which key it was.
+    Check values that would make rl_zoo3 fail without naming the key.
 
     :param entry: A YAML entry
     :param where: File and entry, named in the error
@@ -114,7 +114,7 @@ def check_values(entry: dict[str, Any], where: str) -> None:
         raise ValueError(f"{where}: policy is {_kind(entry.get('policy'))}; write the name of a policy.")
     for key in ("policy_kwargs", "env_kwargs", "monitor_kwargs"):
         value = entry.get(key)
-        # rl_zoo3 evaluates texts such as "dict(net_arch=[64])".
+        # rl_zoo3 evaluates strings such as "dict(net_arch=[64])".
         if not (value is None or isinstance(value, dict) or (isinstance(value, str) and re.match(r"\s*(dict\(|\{)", value))):
             raise ValueError(f"{where}: {key} is {_kind(value)}; write a mapping.")
     callbacks = entry.get("callback") or []

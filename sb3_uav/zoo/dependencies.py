@@ -1,4 +1,4 @@
-"""The packages that training from YAML needs, checked before anything imports them."""
+"""Checks for the packages that training from YAML needs, made before anything imports them."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
-# What values of the wrong kind lead to, while callbacks, environments and the algorithm are made of them.
+# Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
 SETUP_ERRORS = (
     *(TypeError, AttributeError, AssertionError, ModuleNotFoundError, NameError, SyntaxError, LookupError, ArithmeticError),
     *(RuntimeError, MemoryError),
@@ -60,8 +60,8 @@ class UAVExperimentManager(ExperimentManager):
       that diverges, however it does.
     """
 
-    # Whether the command line says how often to evaluate; if not, FixedSetEvalCallback decides, and without it, it is done
-    # once per epoch where there are epochs.
+    # Whether --eval-freq was given. If not, FixedSetEvalCallback determines the frequency; without it, evaluations take place
+    # once per epoch.
     eval_freq_given = False
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
@@ -100,7 +100,7 @@ class UAVExperimentManager(ExperimentManager):
         try:
             super().learn(model)
         except (TypeError, OverflowError) as error:
-            # A value of the wrong type may be used in training only.
+            # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
@@ -126,12 +126,12 @@ class UAVExperimentManager(ExperimentManager):
         """
         Evaluate as the YAML entry suggests.
 
-        :param hyperparams: Of the algorithm
-        :param callbacks: Those of the entry
+        :param hyperparams: Hyperparameters of the algorithm
+        :param callbacks: Callbacks of the entry
         """
         n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
         if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
-            # It does what rl_zoo3's EvalCallback would do, on more than a few random episodes.
+            # It replaces rl_zoo3's EvalCallback, with more than a few random episodes.
             self.eval_freq = -1
         elif n_tasks and "instances_per_epoch" in hyperparams:
             self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
@@ -154,7 +154,7 @@ class UAVExperimentManager(ExperimentManager):
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
         kept = [entry for entry in (given if isinstance(given, list) else [given]) if not is_fixed_set_evaluation(entry)]
-        # By name, so that every trial gets an instance of its own.
+        # By name, so that every trial gets its own instance.
         self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
         try:
             super().hyperparameters_optimization()
@@ -167,7 +167,7 @@ class UAVExperimentManager(ExperimentManager):
         try:
             mean_reward = super().objective(trial)
         except (RuntimeError, FloatingPointError) as error:
-            # rl_zoo3 takes ValueError and AssertionError in training for divergence; torch also raises these.
+            # rl_zoo3 treats ValueError and AssertionError in training as divergence; torch raises these errors too.
             raise optuna.exceptions.TrialPruned(str(error)) from error
         except SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
@@ -183,14 +183,14 @@ class UAVExperimentManager(ExperimentManager):
 
 
 def _described(error: Exception) -> str:
-    """What went wrong, with the kind of error where its text alone would say little."""
+    """The message of an error, with its type where the text alone is unclear."""
     return str(error) if isinstance(error, TypeError | AssertionError | ImportError) else f"{type(error).__name__}: {error}"
 
 
 def is_fixed_set_evaluation(entry: Any) -> bool:
     """
-    :param entry: Of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
-    :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which a trial has no use for
+    :param entry: An item of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
+    :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which trials do not need
     """
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
@@ -198,7 +198,7 @@ def is_fixed_set_evaluation(entry: Any) -> bool:
 
 def find_checkpoint(trained_agent: Path) -> Path:
     """
-    :param trained_agent: The allocator's zip to go on from
+    :param trained_agent: The allocator's zip to resume from
     :return: The folder with the state of its interactive training
     :raises FileNotFoundError: If there is none; the message names the zip to use if there is one near
     """
@@ -207,4 +207,4 @@ def find_checkpoint(trained_agent: Path) -> Path:
         return beside
     if (below / STATE_FILE).is_file():
         return below
-    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which knows its router.")
+    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which names its router.")

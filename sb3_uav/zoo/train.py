@@ -52,7 +52,7 @@ def train(arguments: Sequence[str]) -> None:
         try:
             rl_zoo3.train.train()
         except AssertionError as error:
-            # What rl_zoo3 raises for a wrong argument.
+            # rl_zoo3 raises it for wrong arguments.
             raise ValueError(str(error)) from error
         except FileNotFoundError:
             raise

@@ -1,4 +1,4 @@
-"""What :mod:`sb3_uav.studies.compare.study` compares: entries of our YAMLs, with changes."""
+"""The variants of a comparison: entries of our YAMLs with changes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ ROLLOUT_TEST_INSTANCES = 1_000
 
 class Variant(NamedTuple):
     """
-    One of the things that are compared.
+    One of the compared trainings.
 
-    :param name: How tables and figures call it
+    :param name: Name in tables and figures
     :param algo: rl_zoo3's name of the algorithm
     :param entry: The complete YAML entry of the environment, callbacks included
     """
@@ -80,7 +80,7 @@ def read_variants(path: Path | None, env_id: str) -> list[Variant]:
     """
     :param path: A YAML of variants; the default ones when None
     :param env_id: Id of the environment
-    :return: The variants with the entries of their YAMLs, as they stand there but for what the variants replace
+    :return: The variants with their complete YAML entries
     :raises ValueError: If something is missing or not allowed; the message names it
     """
     given = default_variants(env_id) if path is None else read_yaml(path)
@@ -118,7 +118,7 @@ def callbacks_of(entry: dict[str, Any]) -> list[Any]:
 def router_settings(env_id: str) -> dict[str, Any]:
     """
     :param env_id: Id of an allocation environment
-    :return: How our YAML for REINFORCE trains the router beside its allocator; nothing if it does not
+    :return: Settings of the router in our REINFORCE entry; empty if the entry trains no router
     """
     for callback in callbacks_of(read_entry("reinforce", env_id)):
         if callback_name(callback) == "ITSCallback" and isinstance(callback, dict):

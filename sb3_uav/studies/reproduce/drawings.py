@@ -1,4 +1,4 @@
-"""Figures 3 to 7, drawn from the tables that stand beside them as CSV."""
+"""Figures 3 to 7, drawn from the tables in the CSV files beside them."""
 
 from __future__ import annotations
 
@@ -160,12 +160,12 @@ def draw_generalization(table: Table) -> Any:
 
 
 def _shades(n: int) -> list[Any]:
-    """As many colors of one scale, for things that have an order."""
+    """``n`` colors of one scale, for ordered categories."""
     return [require_matplotlib().colormaps["viridis"](position) for position in np.linspace(0.0, 0.9, n)]
 
 
 def _markers(n_points: int, position: int) -> dict[str, Any]:
-    """Markers where they do not hide the line."""
+    """Marker settings, empty where markers would hide the line."""
     return {"marker": MARKERS[position % len(MARKERS)], "markersize": 4} if n_points <= MAX_MARKERS else {}
 
 

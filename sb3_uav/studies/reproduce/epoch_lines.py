@@ -9,7 +9,7 @@ from types import TracebackType
 
 from sb3_uav.studies.reproduce.pair_training import PairTraining
 
-# Seconds between two looks at the logs of running trainings.
+# Seconds between two reads of the logs of running trainings.
 POLL_INTERVAL = 1.0
 
 
@@ -18,7 +18,7 @@ class EpochLines:
     Prints a line for every epoch that ends while the ``with`` block lasts.
 
     :param jobs: The trainings
-    :param prefix: What every line begins with
+    :param prefix: Prefix of every line
     """
 
     def __init__(self, jobs: Sequence[PairTraining], prefix: str) -> None:
@@ -27,7 +27,7 @@ class EpochLines:
         self._n_lines = {job.title: len(self._lines(job)) for job in jobs}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-        # The trainings of this process send theirs into a file.
+        # Trainings in this process redirect sys.stderr to a file.
         self._stream = sys.stderr
 
     def __enter__(self) -> EpochLines:
@@ -63,6 +63,6 @@ class EpochLines:
 
     def print(self, text: str) -> None:
         """
-        :param text: What else to say
+        :param text: A further line
         """
         print(self.prefix + text, file=self._stream, flush=True)

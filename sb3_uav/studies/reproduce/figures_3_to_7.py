@@ -1,4 +1,4 @@
-"""Figures 3 to 7 of the paper: what they show, as tables."""
+"""The data of the paper's Figures 3 to 7, as tables."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LoggedCurve(NamedTuple):
     :param cost: ``(n_epochs,)``, minus the mean objective of its episodes
     :param phase: Phase of each epoch
     :param minutes: ``(n_epochs,)``, time since the beginning of the training, of both levels
-    :param generation_minutes: How much of all that time went into the router's instances
+    :param generation_minutes: Time spent generating the router's instances
     """
 
     cost: np.ndarray
@@ -49,9 +49,9 @@ class LoggedCurve(NamedTuple):
 
 def read_logged_curves(its_log: Path) -> dict[str, LoggedCurve]:
     """
-    :param its_log: The ``its_log.csv`` of a training, whose lines stand in the order of time
+    :param its_log: The ``its_log.csv`` of a training, in chronological order
     :return: The curves of both levels
-    :raises ValueError: If it is something else
+    :raises ValueError: If the file is not such a log
     """
     rows = read_log(its_log)
     minutes = np.cumsum([float(row["seconds"]) for row in rows]) / 60
@@ -71,8 +71,8 @@ def fig3(session: Session) -> list[Path]:
     """
     Schedules of the trained pairs on one instance of every situation.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     here = scenarios()
     pairs = trained_pairs(session, here, (ITS,))
@@ -99,7 +99,7 @@ def fig3(session: Session) -> list[Path]:
 
 def add_points(points: Table, name: str, instances: Instances, schedule: Schedule) -> None:
     """
-    :param points: Gets a row for the depot and for each task
+    :param points: The table that receives a row for the depot and for each task
     :param name: Name of the situation
     :param instances: One instance
     :param schedule: Its schedule
@@ -123,8 +123,8 @@ def fig4(session: Session) -> list[Path]:
     """
     Learning curves of both levels in all situations.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     here = [scenario for scenario in scenarios() if scenario.n_tasks in session.scale.trained_sizes]
     models = session.models.get([(scenario, ITS) for scenario in here], log_needed=True)
@@ -163,8 +163,8 @@ def fig5(session: Session) -> list[Path]:
     """
     Cost of the upper level with the interactive training strategy and with parts of it left out.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     scenario = Scenario(ABLATION_FLEET, ABLATION_SIZE)
     models = session.models.get([(scenario, strategy) for strategy in ABLATION_STRATEGIES], log_needed=True)
@@ -180,7 +180,7 @@ def fig5(session: Session) -> list[Path]:
     notes.add_stand_ins(session.scale, [])
     for strategy in ABLATION_STRATEGIES:
         if strategy not in curves:
-            notes.add(f"{strategy}: there is no pair with the log of its training, and --no-training forbids to train one.")
+            notes.add(f"{strategy}: there is no pair with the log of its training, and --no-training forbids training one.")
     titles = ("Strategy", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last", "Minutes", "Data generation (min)")
     table = Table("Fig. 5", "Ablation study results of ITS", [Column(title) for title in titles])
     for strategy, levels in curves.items():
@@ -202,8 +202,8 @@ def fig6(session: Session) -> list[Path]:
     """
     Every pair of 4 UAVs on the instances of all sizes.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _generalization(session, "fig6", "Fig. 6", 4)
 
@@ -212,19 +212,19 @@ def fig7(session: Session) -> list[Path]:
     """
     Every pair of 6 UAVs on the instances of all sizes.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _generalization(session, "fig7", "Fig. 7", 6)
 
 
 def _generalization(session: Session, name: str, label: str, n_uavs: int) -> list[Path]:
     """
-    :param session: What to do it with
-    :param name: Of the files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param name: Name of the files, without suffix
     :param label: Number of the figure
-    :param n_uavs: The fleet
-    :return: The files
+    :param n_uavs: Number of UAVs
+    :return: Paths of the written files
     """
     here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
     pairs = trained_pairs(session, here)
@@ -247,7 +247,7 @@ def _generalization(session: Session, name: str, label: str, n_uavs: int) -> lis
             objective = complete(results.rows.get(solver.name), lambda row: row.objective)
             objectives.setdefault(method, {})[scenario.n_tasks] = objective
     if not ours:
-        notes.add("There are no trained pairs, and --no-training forbids to train them.")
+        notes.add("There are no trained pairs, and --no-training forbids training them.")
     caption = f"Generalization to larger instances on U{n_uavs}"
     table = Table(label, caption, [Column("Method"), *(Column(f"N-{size}") for size in SIZES)])
     for method, found in objectives.items():
@@ -259,18 +259,18 @@ def _generalization(session: Session, name: str, label: str, n_uavs: int) -> lis
 def _baselines(
     session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
 ) -> dict[str, Solver]:
-    """The methods of Figs. 6 and 7 that the pairs are compared with, by their names."""
+    """The methods that Figs. 6 and 7 compare the pairs with, by name."""
     found: dict[str, Solver] = {}
     independent = pairs.get((session.scale.trained_for(scenario), INDEPENDENT))
     if "kmeans-vnd" in session.solvers:
         found[KMEANS_VND] = session.evaluator.baseline("kmeans-vnd")
     else:
-        notes.add(f"{KMEANS_VND} was not asked for (--solvers).")
+        notes.add(f"{KMEANS_VND} was not requested (--solvers).")
     if independent is None:
-        notes.add("DL-DRL-I has no trained pair, and --no-training forbids to train one.")
+        notes.add("DL-DRL-I has no trained pair, and --no-training forbids training one.")
         return found
     if "kmeans-am" in session.solvers:
         found[KMEANS_AM] = session.evaluator.baseline("kmeans-am", independent)
     else:
-        notes.add(f"{KMEANS_AM} was not asked for (--solvers).")
+        notes.add(f"{KMEANS_AM} was not requested (--solvers).")
     return {**found, "DL-DRL-I": session.evaluator.pair(independent, sampling=True)}

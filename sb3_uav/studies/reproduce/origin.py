@@ -1,4 +1,4 @@
-"""What every file says of its origin."""
+"""The origin that every file states."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Origin:
             f"{scale.name}, {scale.text}",
             str(seed),
             versions,
-            # No more than says what a time means: neither the kernel nor the name of the machine.
+            # Only what is needed to interpret times: neither the kernel version nor the name of the machine.
             f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
             paper_tables()["source"],
         )
@@ -74,5 +74,5 @@ class Origin:
         )
 
     def footer(self) -> str:
-        """:return: What a picture says of itself"""
+        """:return: The line at the bottom of a picture"""
         return f"sb3-uav reproduce, scale {self['Scale'].partition(',')[0]}, seed {self['Seed']}"

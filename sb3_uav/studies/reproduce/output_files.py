@@ -22,11 +22,11 @@ def write_files(table: Table, origin: Origin, folder: Path, name: str, drawn: Ta
     Write a table in all formats and, if there is something to draw, its figure.
 
     :param table: The table
-    :param origin: Where it comes from
+    :param origin: Its origin
     :param folder: Folder of the files
     :param name: Their name without suffix
-    :param drawn: What the figure is drawn from, which may be the table itself; None if there is no figure
-    :return: The files
+    :param drawn: The data of the figure, which may be the table itself; None if there is no figure
+    :return: Paths of the written files
     :raises ValueError: If they cannot be written
     """
     lay_out(table)

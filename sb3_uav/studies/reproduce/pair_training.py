@@ -1,4 +1,4 @@
-"""Training one pair through the zoo, so that an interrupted training goes on where it stopped."""
+"""Training one pair through the zoo; an interrupted training resumes from its checkpoint."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ITS_KEY = "sb3_uav.training.ITSCallback"
 
 
 class TrainingError(ValueError):
-    """A training that failed."""
+    """A failed training."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class PairTraining:
         return pretraining, self.its["n_epochs"]
 
     def newest_run(self) -> Path | None:
-        """:return: The zoo's folder of the latest run that has a checkpoint, if there is one"""
+        """:return: The zoo's folder of the latest run with a checkpoint, if there is one"""
         from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 
         runs = [state.parents[1] for state in self.run_folder.glob(f"reinforce/*/{CHECKPOINT_FOLDER}/{STATE_FILE}")]
@@ -83,8 +83,8 @@ class PairTraining:
 def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: str) -> dict[str, Any]:
     """
     :param scale: The scale
-    :param recipe: How pairs are trained
-    :param scenario: What for
+    :param recipe: Training settings
+    :param scenario: The scenario to train for
     :param strategy: The training strategy
     :return: The zoo's YAML entry of the scenario with the changes of the recipe
     :raises FileNotFoundError: If the zoo's YAML is missing
@@ -103,7 +103,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
         entry["instances_per_epoch"] = recipe.instances_per_epoch[scenario.n_tasks]
     sizes = {"n_tasks": scale.n_tasks(scenario), "max_distance": scale.max_distance}
     entry["env_kwargs"] = sizes
-    # More than enough: the strategy ends the training after its last epoch.
+    # An upper bound: the strategy ends the training after its last epoch.
     n_instances = entry["instances_per_epoch"] + entry["n_envs"]
     entry["n_timesteps"] = its["n_epochs"] * n_instances * entry.get("n_samples", 1) * sizes["n_tasks"]
     # Independent of what YAML anchors share.
@@ -112,7 +112,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
 
 def train_pair(job: PairTraining) -> None:
     """
-    Train a pair, or go on with an interrupted training, and put its zips where they belong.
+    Train a pair, or resume its training, and copy its zips to the folder of models.
 
     :param job: The training
     :raises TrainingError: If it fails; the message names the file with its output
@@ -134,7 +134,7 @@ def train_pair(job: PairTraining) -> None:
         _run_zoo(job, config, run)
         run = job.newest_run()
     if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.n_epochs[1]:
-        # rl_zoo3 takes Ctrl-C for the end of the training.
+        # rl_zoo3 treats Ctrl-C as the end of the training.
         raise KeyboardInterrupt
     _publish(job, run, state)
 
@@ -143,7 +143,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     """
     :param job: The training
     :param config: Its YAML
-    :param interrupted: The zoo's folder of the run to go on with
+    :param interrupted: The zoo's folder of the run to resume
     :raises TrainingError: If it fails
     """
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
@@ -166,11 +166,11 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
 
 def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     """
-    Copy what a complete training left to the folder of models.
+    Copy the files of a complete training to the folder of models.
 
     :param job: The training
     :param run: The zoo's folder of the run
-    :param state: Of its checkpoint
+    :param state: State of its checkpoint
     """
     from sb3_uav.training.epoch_log import LOG_FILE
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER
@@ -190,7 +190,7 @@ def check_complete(job: PairTraining) -> bool:
     """
     :param job: A training
     :return: Whether it is complete
-    :raises TrainingError: If what is there was trained with other settings
+    :raises TrainingError: If the existing pair was trained with other settings
     """
     path = job.model_folder / TRAINING_FILE
     if not path.is_file():

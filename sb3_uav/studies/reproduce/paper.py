@@ -1,4 +1,4 @@
-"""What the paper itself reports: its Tables I to IV, as data."""
+"""The figures of the paper's Tables I to IV."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from sb3_uav.registration import GENERALISATION_SIZES, PAPER_FLEETS, PAPER_SIZES
 
 FLEETS = PAPER_FLEETS
-# Of Tables I to III and all figures.
+# Numbers of tasks in Tables I to III and in all figures.
 SIZES = PAPER_SIZES
-# Of Table IV, which ends at 1000 tasks in the paper.
+# Numbers of tasks in Table IV, which ends at 1000 in the paper.
 LARGER_SIZES = GENERALISATION_SIZES
-# Of an epoch.
+# Training instances of an epoch.
 INSTANCES_PER_EPOCH = 1_280_000
 MAX_DISTANCE = 2.0
 # "all the instances are randomly generated with seed 1234" (section V-B, of Fig. 3)
@@ -50,8 +50,8 @@ def paper_tables() -> dict[str, Any]:
 def paper_figure(table: str, *path: str) -> float | None:
     """
     :param table: ``"table1"`` to ``"table4"``
-    :param path: Where the figure stands in the ``rows`` of the table
-    :return: The figure that the paper prints, None if it prints none
+    :param path: Keys of the figure in the ``rows`` of the table
+    :return: The figure that the paper prints; None if it prints none
     """
     found: Any = paper_tables()[table]["rows"]
     for key in path:

@@ -21,7 +21,7 @@ LATEX_SPECIAL = str.maketrans(
 class Column:
     """
     :param title: Title of the column
-    :param group: What stands above it and its neighbours of the same group
+    :param group: Heading above neighboring columns of the same group
     """
 
     title: str
@@ -29,20 +29,20 @@ class Column:
 
     @property
     def flat(self) -> str:
-        """Both in one line."""
+        """Group and title in one line."""
         return f"{self.group}: {self.title}" if self.group else self.title
 
 
 @dataclass
 class Table:
     """
-    :param label: Its name and number in the paper
-    :param caption: What the table shows
+    :param label: Name and number in the paper, e.g., ``Table II``
+    :param caption: Caption without the label
     :param columns: Its columns
     :param rows: Its cells, as text
     :param rules: Indices of rows that begin a new part
-    :param bold: Row and column of cells that stand out
-    :param notes: What has to be known to read it
+    :param bold: Row and column of bold cells
+    :param notes: Notes for the reader
     """
 
     label: str
@@ -79,8 +79,8 @@ def number(value: float | None, digits: int = 2) -> str:
 def to_markdown(table: Table, about: Sequence[str]) -> str:
     """
     :param table: The table
-    :param about: Where it comes from, line by line
-    :return: Markdown with the table, its notes and where it comes from
+    :param about: Lines on its origin
+    :return: Markdown with the table, its notes and its origin
     """
 
     def line(cells: Iterable[str]) -> str:
@@ -97,14 +97,14 @@ def to_markdown(table: Table, about: Sequence[str]) -> str:
 
 
 def _numeric(table: Table) -> list[bool]:
-    """Which columns hold nothing but numbers."""
+    """Whether each column holds only numbers."""
     return [not any(map(str.isalpha, "".join(row[column] for row in table.rows))) for column in range(len(table.columns))]
 
 
 def to_latex(table: Table, about: Sequence[str]) -> str:
     """
     :param table: The table
-    :param about: Where it comes from, as comments
+    :param about: Lines on its origin, written as comments
     :return: A LaTeX table; it needs the packages booktabs and graphicx
     """
 
@@ -138,8 +138,8 @@ def to_latex(table: Table, about: Sequence[str]) -> str:
 def to_csv(table: Table, about: Sequence[str]) -> str:
     """
     :param table: The table
-    :param about: Where it comes from, as lines that begin with ``#``, like the notes
-    :return: CSV, for example for ``pandas.read_csv(path, comment="#")``; cells without a figure are empty
+    :param about: Lines on its origin, written as ``#`` comments like the notes
+    :return: CSV, readable by ``pandas.read_csv(path, comment="#")``; missing figures are empty cells
     """
     text = io.StringIO()
     text.writelines(f"# {item}\n" for item in (table.heading, *about, *table.notes))
@@ -151,9 +151,9 @@ def to_csv(table: Table, about: Sequence[str]) -> str:
 
 def read_csv(path: Path) -> tuple[Table, list[str]]:
     """
-    :param path: What :func:`to_csv` wrote
-    :return: The table without notes, rules and bold cells; and the other comments, that is where it comes from and its notes
-    :raises ValueError: If it is something else
+    :param path: A file written from :func:`to_csv`
+    :return: The table without notes, rules and bold cells; and the comments after the caption: origin and notes
+    :raises ValueError: If the file is not such a log
     :raises OSError: If it cannot be read
     """
     try:

@@ -1,4 +1,4 @@
-"""Which cells of our tables stand out, and where their parts begin; both follow from the cells alone."""
+"""Which cells of our tables are bold, and where their parts begin; both follow from the cells alone."""
 
 from __future__ import annotations
 

@@ -41,12 +41,12 @@ FASTEST_SHOWN = 0.1
 
 class PhaseTimes(NamedTuple):
     """
-    Seconds per instance, NaN where the log does not tell.
+    Seconds per instance; NaN where the log does not contain them.
 
-    :param upper: Of the allocator's epochs
-    :param lower: Of the router's, without the time that went into its instances
-    :param generation: Of making the router's instances
-    :param n_instances: How many instances an epoch has
+    :param upper: Seconds of the allocator's epochs
+    :param lower: Seconds of the router's epochs, without generating its instances
+    :param generation: Seconds spent generating the router's instances
+    :param n_instances: Instances per epoch
     """
 
     upper: float
@@ -58,7 +58,7 @@ class PhaseTimes(NamedTuple):
 def seconds(value: float | None) -> str:
     """
     :param value: A time
-    :return: Text for a cell, with more digits where two would say nothing
+    :return: Text for a cell, with more digits for short times
     """
     return number(value, 2 if value is None or math.isnan(value) or value >= FASTEST_SHOWN else 4)
 
@@ -70,8 +70,8 @@ def table1(session: Session) -> list[Path]:
     """
     Time of training per epoch: upper level, lower level, generation of the lower level's data.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     models = session.models.timed(scenarios())
     groups = [Column(source, phase) for phase in PHASES for source in (PAPER, OURS)]
@@ -79,7 +79,7 @@ def table1(session: Session) -> list[Path]:
     notes = Notes(
         f"Minutes per epoch of {INSTANCES_PER_EPOCH:,} instances. The paper's: one RTX 3090, two from 300 tasks on. Ours are "
         "measured over fewer instances and multiplied; the first epoch, whose baseline is cheaper, is left out.",
-        "Lower-level and data generation: epochs of the alternate phase, where an epoch's subsets are all generated anew.",
+        "Lower-level and data generation: epochs of the alternate phase, where all subsets of an epoch are newly generated.",
     )
     given = session.models.given
     own = [scenario.name for scenario, model in models.items() if given is not None and model.folder.is_relative_to(given)]
@@ -115,8 +115,8 @@ def _batch_size(session: Session) -> int:
 def phase_times(model: Model) -> PhaseTimes:
     """
     :param model: A trained pair with the log of its training
-    :return: How long the phases of an epoch took
-    :raises ValueError: If the log is something else
+    :return: Durations of the phases of an epoch
+    :raises ValueError: If the file is not such a log
     """
     assert model.its_log is not None
     rows = read_log(model.its_log)
@@ -125,7 +125,7 @@ def phase_times(model: Model) -> PhaseTimes:
     alternate = [row for row in rows if row["level"] == "router" and row["phase"] == "alternate"]
     lower = alternate[1:] or alternate
     nothing = {"seconds": "nan", "generation_seconds": "nan", "n_instances": "1"}
-    # A log of an earlier version does not tell the generation from the learning.
+    # Logs of earlier versions do not separate generation from training.
     generation = _per_instance(lower or [nothing], "generation_seconds")
     return PhaseTimes(
         _per_instance(upper or [nothing], "seconds"),
@@ -147,8 +147,8 @@ def table2(session: Session) -> list[Path]:
     """
     Experiment results with 4 UAVs.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _results_table(session, "table2", "Table II", 4)
 
@@ -157,19 +157,19 @@ def table3(session: Session) -> list[Path]:
     """
     Experiment results with 6 UAVs.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _results_table(session, "table3", "Table III", 6)
 
 
 def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list[Path]:
     """
-    :param session: What to do it with
-    :param name: Of the files and of the paper's data
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param name: Name of the files, and of the table in the paper's data
     :param label: Its number
-    :param n_uavs: The fleet
-    :return: The files
+    :param n_uavs: Number of UAVs
+    :return: Paths of the written files
     """
     here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
     pairs = trained_pairs(session, here)
@@ -214,8 +214,8 @@ def trained_pairs(
     session: Session, wanted: Sequence[Scenario], strategies: Sequence[str] = (ITS, INDEPENDENT)
 ) -> dict[tuple[Scenario, str], Model]:
     """
-    :param session: Finds or trains them
-    :param wanted: What is to be solved
+    :param session: The session, which finds or trains the pairs
+    :param wanted: The scenarios to solve
     :param strategies: Training strategies
     :return: The pairs that solve the scenarios; without those that are missing and may not be trained
     """
@@ -228,24 +228,24 @@ def _solvers(
     session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
 ) -> dict[str, Solver]:
     """
-    :param session: What to do it with
-    :param scenario: What is to be solved
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param scenario: The scenario to solve
     :param pairs: The trained pairs
-    :param notes: What is left out is said there
-    :return: The solvers by their columns
+    :param notes: Receives what is left out
+    :return: The solvers by column
     """
     found: dict[str, Solver] = {}
     trained = session.scale.trained_for(scenario)
     independent, ours = pairs.get((trained, INDEPENDENT)), pairs.get((trained, ITS))
     for solver, column in BASELINES.items():
         if solver not in session.solvers:
-            notes.add(f"{column} was not asked for (--solvers).")
+            notes.add(f"{column} was not requested (--solvers).")
         elif solver != "kmeans-am":
             found[column] = session.evaluator.baseline(solver)
         elif independent is not None:
             found[column] = session.evaluator.baseline(solver, independent)
     if KMEANS_AM in found:
-        notes.add(f"{KMEANS_AM} uses the router of DL-DRL-I, which has learned from whole uniform instances only.")
+        notes.add(f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only.")
     for column, model, sampling in (
         (INDEPENDENT_GREEDY, independent, False),
         (INDEPENDENT_SAMPLING, independent, True),
@@ -255,7 +255,7 @@ def _solvers(
         if model is not None:
             found[column] = session.evaluator.pair(model, sampling)
         else:
-            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids to train one.")
+            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids training one.")
     found |= {solver: session.evaluator.baseline(solver) for solver in session.extra_solvers}
     return found
 
@@ -276,12 +276,12 @@ def _say_how_exact(errors: Sequence[float], notes: Notes) -> None:
     if known:
         notes.add(
             f"Our instances are not the paper's: the standard errors of our mean objectives go up to {max(known):.2f}. "
-            "Methods of the same block solve the same instances, and can be compared more exactly than that."
+            "Methods of the same block solve the same instances, and are comparable more precisely."
         )
 
 
 def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """What the solvers of the exact block achieve, by their columns."""
+    """Summaries of the solvers of the exact block, by column."""
     scale = session.scale
     chosen = {column: solvers[column] for column in EXACT_COLUMNS if column in solvers}
     if GUROBI in chosen:
@@ -297,14 +297,14 @@ def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Sol
 
 
 def _block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """What solvers achieve on the test instances, by their columns."""
+    """Summaries of solvers on the test instances, by column."""
     results = session.evaluator.run(scenario, list(solvers.values()))
     notes.add(*results.failures)
     return {column: results.rows[solver.name] for column, solver in solvers.items() if solver.name in results.rows}
 
 
 def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[str, list[float | None]]:
-    """The figures of a block: for every measure one for each method."""
+    """The figures of a block: for each measure, one per method."""
     objectives = [complete(rows.get(method), lambda row: row.objective) for method in methods]
     shown = [math.nan if objective is None else objective for objective in objectives]
     return {
@@ -319,10 +319,10 @@ def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[st
 
 def table4(session: Session) -> list[Path]:
     """
-    Generalisation of pairs trained with 500 tasks to 600 and more.
+    Generalization of pairs trained with 500 tasks to 600 and more.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     here = scenarios(LARGER_SIZES)
     pairs = trained_pairs(session, here)
@@ -377,7 +377,7 @@ def table4(session: Session) -> list[Path]:
 def _larger(
     session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
 ) -> dict[str, SummaryRow]:
-    """What the methods of Table IV achieve, by their names."""
+    """Summaries of the methods of Table IV, by name."""
     columns = {"DL-DRL-I": INDEPENDENT_SAMPLING, "DL-DRL": SAMPLING}
     all_solvers = _solvers(session, scenario, pairs, Notes())
     solvers = {
@@ -387,5 +387,5 @@ def _larger(
     }
     for method in LARGER_METHODS:
         if method not in solvers:
-            notes.add(f"{method} was not asked for (--solvers), or --no-training forbids to train its pair.")
+            notes.add(f"{method} was not requested (--solvers), or --no-training forbids training its pair.")
     return _block(session, scenario, solvers, notes)
