@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,14 @@ from sb3_uav.studies.reproduce import paper
 from sb3_uav.studies.reproduce.evaluator import Evaluator
 from sb3_uav.studies.reproduce.figures_3_to_7 import read_logged_curves
 from sb3_uav.studies.reproduce.origin import Origin
-from sb3_uav.studies.reproduce.pair_training import training_entry
-from sb3_uav.studies.reproduce.pairs import ITS, Model
+from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
+from sb3_uav.studies.reproduce.pairs import Model
 from sb3_uav.studies.reproduce.paper import paper_figure, paper_tables
-from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
+from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario, scenarios
 from sb3_uav.studies.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
 from sb3_uav.studies.reproduce.table_layout import best, lay_out
 from sb3_uav.studies.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS, NO_INTENSIVE
 
 pytest.importorskip("rl_zoo3")
 
@@ -117,11 +120,46 @@ def test_training_entries() -> None:
     assert (entry["n_envs"], entry["instances_per_epoch"], entry["learning_rate"]) == (256, 1_280_000, 1e-4)
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
     assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
-    cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), "ITS/intensive")
+    cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), NO_INTENSIVE)
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (cpu["instances_per_epoch"], cpu["baseline"], its["router"]["baseline"]) == (320, "shared", "shared")
-    assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("ITS/intensive", 24, 8)
+    assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("no-intensive", 24, 8)
     assert training_entry(SMOKE, SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
+
+
+def training(scale: Scale, scenario: Scenario, strategy: str) -> PairTraining:
+    entry = training_entry(scale, scale.recipe, scenario, strategy)
+    return PairTraining(scenario, strategy, entry, Path("runs"), Path("models"), 0, "cpu", 1)
+
+
+@pytest.mark.parametrize("scale", SCALES.values(), ids=str)
+def test_the_independent_router_is_trained_as_long_as_that_of_its(scale: Scale) -> None:
+    """The fault: only in the epochs of pre-training, so that DL-DRL-I and K-means+AM had a router of five epochs."""
+    for scenario in scenarios():
+        independent, its = (training(scale, scenario, strategy).schedule for strategy in (INDEPENDENT, ITS))
+        assert independent.n_router_epochs == independent.n_pretraining_epochs == its.n_router_epochs
+        assert its.n_router_epochs > its.n_pretraining_epochs and independent.n_epochs == its.n_epochs
+    assert training(PAPER, Scenario(4, 80), INDEPENDENT).schedule.n_router_epochs == 5 + 8 + 92
+
+
+def test_pairs_of_earlier_versions(tmp_path: Path) -> None:
+    """The paper's names of the strategies are the same strategies; routers of DL-DRL-I that were trained too briefly are not."""
+    for strategy, old_name, fits in ((NO_INTENSIVE, "ITS/intensive", True), (INDEPENDENT, "independent", False)):
+        job = replace(training(SMOKE, Scenario(4, 80), strategy), model_folder=tmp_path / strategy)
+        entry = json.loads(json.dumps(job.entry))
+        entry["callback"][0]["sb3_uav.training.ITSCallback"]["strategy"] = old_name
+        job.model_folder.mkdir()
+        (job.model_folder / "training.json").write_text(json.dumps({"seed": 0, "entry": entry}))
+        if fits:
+            assert check_complete(job)
+        else:
+            with pytest.raises(TrainingError, match="was trained with other settings"):
+                check_complete(job)
+
+
+def test_tables_have_the_papers_names_of_the_strategies() -> None:
+    titles = [paper.STRATEGY_TITLES[strategy] for strategy in paper.ABLATION_STRATEGIES]
+    assert titles == ["ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive"]
 
 
 def test_test_instances() -> None:

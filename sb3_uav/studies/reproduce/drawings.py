@@ -22,7 +22,6 @@ DEPOT = "depot"
 UPPER_LEVEL, LOWER_LEVEL = "Upper level", "Lower level"
 SCHEDULE_COLUMNS = ("Situation", "Point", "x", "y", "Maximum distance", "UAV", "Stop")
 CURVE_COLUMNS = ("Training", "Level", "Epoch", "Phase", "Cost", "Minutes")
-STRATEGY_TITLES = {"ITS": "ITS (ours)"}
 
 
 class Curve(NamedTuple):
@@ -120,7 +119,11 @@ def draw_ablation(table: Table) -> Any:
     style_axes(right, "by training time", "minutes", "")
     for position, (strategy, levels) in enumerate(read_curves(table).items()):
         curve = levels[UPPER_LEVEL]
-        look = {"color": SERIES_COLORS[position], "linewidth": 1.5, "label": STRATEGY_TITLES.get(strategy, strategy)}
+        look = {
+            "color": SERIES_COLORS[position],
+            "linewidth": 1.5,
+            "label": f"{strategy} (ours)" if strategy == "ITS" else strategy,
+        }
         look |= _markers(len(curve.cost), position)
         left.plot(np.arange(1, len(curve.cost) + 1), curve.cost, **look)
         right.plot(curve.minutes, curve.cost, **look)

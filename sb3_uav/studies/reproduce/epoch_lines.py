@@ -48,7 +48,7 @@ class EpochLines:
             lines = self._lines(job)
             for line in lines[self._n_lines[job.title] :]:
                 epoch, level, phase, _, objective, seconds = line.split(",")[:6]
-                n_epochs = f" of {job.n_epochs[1]}" if level == "allocator" else ""
+                n_epochs = f" of {job.schedule.n_epochs}" if level == "allocator" else ""
                 text = f"{level} epoch {epoch}{n_epochs} ({phase}): {float(objective):.2f} tasks, {float(seconds):.0f} s"
                 self.print(f"{job.title}: {text}")
             self._n_lines[job.title] = len(lines)

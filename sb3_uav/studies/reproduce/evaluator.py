@@ -20,6 +20,7 @@ from sb3_uav.solvers.unavailable import UnavailableSolver
 from sb3_uav.studies.reproduce.pairs import Model
 from sb3_uav.studies.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
 from sb3_uav.studies.reproduce.scales import Scale, Scenario
+from sb3_uav.training.its_schedule import INDEPENDENT
 
 # The solvers that stand for the paper's baselines.
 BASELINES = {"milp": GUROBI, "ortools": OR_TOOLS, "kmeans-vnd": KMEANS_VND, "kmeans-am": KMEANS_AM}
@@ -133,7 +134,7 @@ class Evaluator:
 
         decode = "sampling" if sampling else "greedy"
         solver = load_dl_drl(str(model.allocator), str(model.router), decode, self.scale.samples, self.device)
-        method = "DL-DRL-I" if model.strategy == "independent" else "DL-DRL"
+        method = "DL-DRL-I" if model.strategy == INDEPENDENT else "DL-DRL"
         solver.name = f"{method} {model.label} ({f'sampling {self.scale.samples}' if sampling else 'greedy'})"
         return solver
 

@@ -13,7 +13,7 @@ from sb3_uav.envs.schedule import Schedule, check_schedule
 from sb3_uav.solvers.base import Solver
 from sb3_uav.studies.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
 from sb3_uav.studies.reproduce.evaluator import complete
-from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, LEVELS, Model, read_log
+from sb3_uav.studies.reproduce.pairs import LEVELS, Model, read_log
 from sb3_uav.studies.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
@@ -22,11 +22,13 @@ from sb3_uav.studies.reproduce.paper import (
     KMEANS_AM,
     KMEANS_VND,
     SIZES,
+    STRATEGY_TITLES,
 )
 from sb3_uav.studies.reproduce.scales import Scenario, scenarios
 from sb3_uav.studies.reproduce.session import Notes, Session
 from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, number
 from sb3_uav.studies.reproduce.tables_1_to_4 import trained_pairs
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
 
@@ -180,7 +182,9 @@ def fig5(session: Session) -> list[Path]:
     notes.add_stand_ins(session.scale, [])
     for strategy in ABLATION_STRATEGIES:
         if strategy not in curves:
-            notes.add(f"{strategy}: there is no pair with the log of its training, and --no-training forbids training one.")
+            notes.add(
+                f"{STRATEGY_TITLES[strategy]}: there is no pair with the log of its training, and --no-training forbids training one."
+            )
     titles = ("Strategy", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last", "Minutes", "Data generation (min)")
     table = Table("Fig. 5", "Ablation study results of ITS", [Column(title) for title in titles])
     for strategy, levels in curves.items():
@@ -190,9 +194,19 @@ def fig5(session: Session) -> list[Path]:
             raise ValueError(f"{log}: has no epochs of the allocator; give the log of a whole training, or take it away.")
         minutes = max(curve.minutes[-1] for curve in levels.values() if len(curve.minutes) > 0)
         costs = [number(float(cost)) for cost in (upper.cost[0], upper.cost.min(), upper.cost[-1])]
-        table.add([strategy, str(len(upper.cost)), *costs, number(float(minutes), 3), number(upper.generation_minutes, 3)])
+        table.add(
+            [
+                STRATEGY_TITLES[strategy],
+                str(len(upper.cost)),
+                *costs,
+                number(float(minutes), 3),
+                number(upper.generation_minutes, 3),
+            ]
+        )
     table.notes = notes.list()
-    return session.write(table, "fig5", _curves_table("Fig. 5", curves, table.notes))
+    return session.write(
+        table, "fig5", _curves_table("Fig. 5", {STRATEGY_TITLES[s]: c for s, c in curves.items()}, table.notes)
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------- Figs. 6 and 7

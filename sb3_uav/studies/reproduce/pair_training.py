@@ -18,6 +18,7 @@ from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
 from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
 TRAINING_FILE = "training.json"
@@ -67,10 +68,11 @@ class PairTraining:
         return self.entry["callback"][0][ITS_KEY]
 
     @property
-    def n_epochs(self) -> tuple[int, int]:
-        """How many epochs of pre-training and of the allocator there are."""
-        pretraining = 0 if self.strategy.startswith("ITS/pre-training") else self.its["n_pretraining_epochs"]
-        return pretraining, self.its["n_epochs"]
+    def schedule(self) -> EpochSchedule:
+        """The epochs of both levels."""
+        its = self.its
+        names = ("n_epochs", "n_pretraining_epochs", "n_intensive_epochs", "n_continuous_epochs")
+        return EpochSchedule.of(self.strategy, *(its[name] for name in names))
 
     def newest_run(self) -> Path | None:
         """:return: The zoo's folder of the latest run with a checkpoint, if there is one"""
@@ -130,10 +132,10 @@ def train_pair(job: PairTraining) -> None:
         )
     with replaced_when_complete(config) as file:
         file.write(text)
-    if run is None or read_state(run / CHECKPOINT_FOLDER)["epoch"] < job.n_epochs[1]:
+    if run is None or read_state(run / CHECKPOINT_FOLDER)["epoch"] < job.schedule.n_epochs:
         _run_zoo(job, config, run)
         run = job.newest_run()
-    if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.n_epochs[1]:
+    if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.schedule.n_epochs:
         # rl_zoo3 treats Ctrl-C as the end of the training.
         raise KeyboardInterrupt
     _publish(job, run, state)
@@ -181,7 +183,15 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["allocator"], temporary / ALLOCATOR_FILE)
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["router"], temporary / ROUTER_FILE)
     shutil.copyfile(run / LOG_FILE, temporary / ITS_LOG)
-    about = {"seed": job.seed, "strategy": job.strategy, "entry": job.entry, "run": str(run), **describe_machine()}
+    n_router_epochs = job.schedule.n_router_epochs
+    about = {
+        "seed": job.seed,
+        "strategy": job.strategy,
+        "n_router_epochs": n_router_epochs,
+        "entry": job.entry,
+        "run": str(run),
+        **describe_machine(),
+    }
     (temporary / TRAINING_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     os.replace(temporary, job.model_folder)
 
@@ -197,7 +207,7 @@ def check_complete(job: PairTraining) -> bool:
         return False
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-        same = about["entry"] == job.entry and about["seed"] == job.seed
+        same = _same_training(about, job)
     except (ValueError, LookupError, TypeError) as error:
         raise TrainingError(f"{path}: is damaged ({error}); delete {job.model_folder}.") from error
     if not same:
@@ -206,3 +216,18 @@ def check_complete(job: PairTraining) -> bool:
             "name its folder by --models to use it as it is."
         )
     return True
+
+
+def _same_training(about: Mapping[str, Any], job: PairTraining) -> bool:
+    """
+    :param about: What :data:`TRAINING_FILE` says of a trained pair
+    :param job: A training
+    :return: Whether the pair is its result. Earlier versions used the paper's names of the strategies, and trained the router
+        of DL-DRL-I in the epochs of pre-training only
+    """
+    its = {**about["entry"]["callback"][0][ITS_KEY]}
+    its["strategy"] = strategy_name(its["strategy"])
+    entry = {**about["entry"], "callback": [{ITS_KEY: its}, *about["entry"]["callback"][1:]]}
+    n_router_epochs = job.schedule.n_router_epochs
+    earlier = its["n_pretraining_epochs"] if job.strategy == INDEPENDENT else n_router_epochs
+    return entry == job.entry and about["seed"] == job.seed and about.get("n_router_epochs", earlier) == n_router_epochs

@@ -17,15 +17,15 @@ from sb3_uav.studies.reproduce.pair_training import (
 )
 from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.studies.reproduce.training_processes import train_pairs
+from sb3_uav.training.its_schedule import ALTERNATE_ONLY, INDEPENDENT, ITS, NO_INTENSIVE, NO_PRETRAINING
 
-ITS, INDEPENDENT = "ITS", "independent"
 LEVELS = ("allocator", "router")
 # Folders of the strategies; those of the ablation without what their names say.
 STRATEGY_FOLDERS = {
     ITS: "ITS",
-    "ITS/pre-training": "ITS-without-pre-training",
-    "ITS/intensive": "ITS-without-intensive",
-    "ITS/pre-training&intensive": "ITS-without-both",
+    NO_PRETRAINING: "ITS-without-pre-training",
+    NO_INTENSIVE: "ITS-without-intensive",
+    ALTERNATE_ONLY: "ITS-without-both",
     INDEPENDENT: "independent",
 }
 # Required columns of a log and their types.

@@ -8,6 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 from sb3_uav.registration import GENERALISATION_SIZES, PAPER_FLEETS, PAPER_SIZES
+from sb3_uav.training.its_schedule import ALTERNATE_ONLY, ITS, NO_INTENSIVE, NO_PRETRAINING, PAPER_STRATEGIES
 
 FLEETS = PAPER_FLEETS
 # Numbers of tasks in Tables I to III and in all figures.
@@ -21,7 +22,9 @@ MAX_DISTANCE = 2.0
 FIG3_SEED = 1234
 # The ablation of Fig. 5.
 ABLATION_FLEET, ABLATION_SIZE = 4, 80
-ABLATION_STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive")
+ABLATION_STRATEGIES = (ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY)
+# Names of the training strategies in tables and figures.
+STRATEGY_TITLES = {name: title for title, name in PAPER_STRATEGIES.items()}
 
 EXACT_BLOCK, FULL_BLOCK = "30 instances", "500 instances"
 GUROBI = "Gurobi (1800s)"

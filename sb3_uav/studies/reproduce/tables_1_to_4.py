@@ -10,7 +10,7 @@ from typing import NamedTuple
 from sb3_uav.evaluation.summary import SummaryRow, gaps
 from sb3_uav.solvers.base import Solver
 from sb3_uav.studies.reproduce.evaluator import BASELINES, complete
-from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, Model, read_log
+from sb3_uav.studies.reproduce.pairs import Model, read_log
 from sb3_uav.studies.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
@@ -34,6 +34,7 @@ from sb3_uav.studies.reproduce.paper import (
 from sb3_uav.studies.reproduce.scales import Scenario, scenarios
 from sb3_uav.studies.reproduce.session import Notes, Session
 from sb3_uav.studies.reproduce.table_formats import Column, Table, number
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 PAPER, OURS = "paper", "ours"
 FASTEST_SHOWN = 0.1
@@ -245,7 +246,9 @@ def _solvers(
         elif independent is not None:
             found[column] = session.evaluator.baseline(solver, independent)
     if KMEANS_AM in found:
-        notes.add(f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only.")
+        notes.add(
+            f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only, as many epochs as that of DL-DRL."
+        )
     for column, model, sampling in (
         (INDEPENDENT_GREEDY, independent, False),
         (INDEPENDENT_SAMPLING, independent, True),
