@@ -143,7 +143,7 @@ def test_the_independent_router_is_trained_as_long_as_that_of_its(scale: Scale) 
 
 
 def test_pairs_of_earlier_versions(tmp_path: Path) -> None:
-    """The paper's names of the strategies are the same strategies; routers of DL-DRL-I that were trained too briefly are not."""
+    """The paper's names of the strategies mean the same; routers of DL-DRL-I that were trained too briefly are not used."""
     for strategy, old_name, fits in ((NO_INTENSIVE, "ITS/intensive", True), (INDEPENDENT, "independent", False)):
         job = replace(training(SMOKE, Scenario(4, 80), strategy), model_folder=tmp_path / strategy)
         entry = json.loads(json.dumps(job.entry))

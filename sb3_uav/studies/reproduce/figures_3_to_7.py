@@ -182,9 +182,8 @@ def fig5(session: Session) -> list[Path]:
     notes.add_stand_ins(session.scale, [])
     for strategy in ABLATION_STRATEGIES:
         if strategy not in curves:
-            notes.add(
-                f"{STRATEGY_TITLES[strategy]}: there is no pair with the log of its training, and --no-training forbids training one."
-            )
+            title = STRATEGY_TITLES[strategy]
+            notes.add(f"{title}: there is no pair with the log of its training, and --no-training forbids training one.")
     titles = ("Strategy", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last", "Minutes", "Data generation (min)")
     table = Table("Fig. 5", "Ablation study results of ITS", [Column(title) for title in titles])
     for strategy, levels in curves.items():
@@ -194,15 +193,8 @@ def fig5(session: Session) -> list[Path]:
             raise ValueError(f"{log}: has no epochs of the allocator; give the log of a whole training, or take it away.")
         minutes = max(curve.minutes[-1] for curve in levels.values() if len(curve.minutes) > 0)
         costs = [number(float(cost)) for cost in (upper.cost[0], upper.cost.min(), upper.cost[-1])]
-        table.add(
-            [
-                STRATEGY_TITLES[strategy],
-                str(len(upper.cost)),
-                *costs,
-                number(float(minutes), 3),
-                number(upper.generation_minutes, 3),
-            ]
-        )
+        times = [number(float(minutes), 3), number(upper.generation_minutes, 3)]
+        table.add([STRATEGY_TITLES[strategy], str(len(upper.cost)), *costs, *times])
     table.notes = notes.list()
     return session.write(
         table, "fig5", _curves_table("Fig. 5", {STRATEGY_TITLES[s]: c for s, c in curves.items()}, table.notes)
