@@ -247,8 +247,8 @@ def _solvers(
             found[column] = session.evaluator.baseline(solver, independent)
     if KMEANS_AM in found:
         notes.add(
-            f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only, for as many epochs as "
-            "that of DL-DRL."
+            f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only, for as many "
+            "epochs as that of DL-DRL."
         )
     for column, model, sampling in (
         (INDEPENDENT_GREEDY, independent, False),
