@@ -7,13 +7,13 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from sb3_uav.registration import GENERALISATION_SIZES, PAPER_FLEETS, PAPER_SIZES
+from sb3_uav.registration import GENERALIZATION_SIZES, PAPER_FLEETS, PAPER_SIZES
 
 FLEETS = PAPER_FLEETS
 # Of Tables I to III and all figures.
 SIZES = PAPER_SIZES
 # Of Table IV, which ends at 1000 tasks in the paper.
-LARGER_SIZES = GENERALISATION_SIZES
+LARGER_SIZES = GENERALIZATION_SIZES
 # Of an epoch.
 INSTANCES_PER_EPOCH = 1_280_000
 MAX_DISTANCE = 2.0
