@@ -17,7 +17,7 @@ from sb3_uav.envs.generators import training_batch
 
 @pytest.fixture(params=["float64", "float16", "meta"])
 def changed_default(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Another default dtype; or the device "meta", which holds no numbers, in the place of "cuda"."""
+    """Another default dtype, or the device "meta", which stands in for "cuda"."""
     if request.param == "meta":
         th.set_default_device("meta")
     else:
@@ -28,7 +28,7 @@ def changed_default(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def run(level: str) -> list[object]:
-    """What an episode shows and earns, and a picture of its end."""
+    """Observations, rewards and the final picture of an episode, and rewards of a BatchedVecEnv."""
     env = make(level, n_tasks=5, render_mode="rgb_array")
     observations, rewards = play(env, np.random.default_rng(0), seed=3)
     shown = [{key: value.tolist() for key, value in observation.items()} for observation in observations]

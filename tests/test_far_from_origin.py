@@ -1,4 +1,4 @@
-"""Fields far from the origin, as map projections give them: the same plans as at the origin."""
+"""Fields far from the origin, as in map projections: the same plans as at the origin."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def field(offset: tuple[float, float], n_tasks: int = 60, batch_size: int = 6) -
 
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_networks_plan_as_well_far_from_the_origin(offset: tuple[float, float]) -> None:
-    """float32 before the depot was subtracted lost 2 to 40 % there."""
+    """Subtracting the depot in float32 instead of float64 lost 2 to 40 % there."""
     solver = make_solver("dl-drl")
     objectives = []
     for instances in (field((0.0, 0.0)), field(offset)):
@@ -43,7 +43,7 @@ def test_networks_plan_as_well_far_from_the_origin(offset: tuple[float, float]) 
     seed=st.integers(0, 1000),
 )
 def test_both_drivers_see_the_same_numbers(level: str, offset: float, scale: float, seed: int) -> None:
-    """The observation of the step loop, and what the fused driver makes of the instances."""
+    """The step loop's observation equals the fused driver's input."""
     rng = np.random.default_rng(seed)
     points = offset + scale * rng.random((7, 2))
     instance = Instances.from_arrays(points[0], points[1:], max_distance=2 * scale)
@@ -51,7 +51,7 @@ def test_both_drivers_see_the_same_numbers(level: str, offset: float, scale: flo
     fused = StaticObservation.from_instances(instance)
     assert np.array_equal(observation["depot"], fused.depot[0].numpy())
     assert np.array_equal(observation["tasks"], fused.tasks[0].flatten().numpy())
-    # Digits that float32 keeps of the positions relative to the depot, at the accuracy of float64 there.
+    # Positions relative to the depot, to within the float64 resolution at that offset.
     seen = observation["tasks"].reshape(-1, 2).astype(float) - observation["depot"]
     assert np.allclose(seen, points[1:] - points[0], atol=1e-5 * 2 * scale, rtol=0)
 
@@ -69,6 +69,6 @@ def test_instances_near_the_origin_are_seen_as_they_are() -> None:
 
 
 def test_padding_is_no_task_far_from_the_origin() -> None:
-    """Padded slots stay in the depot, wherever it is shown."""
+    """Padded slots remain at the depot."""
     shown = field((1e7, 1e7), n_tasks=3).pad(5).near_origin()
     assert (shown.depot == 0).all() and (shown.tasks[:, 3:] == 0).all() and not shown.task_mask[:, 3:].any()

@@ -80,7 +80,7 @@ def test_from_arrays_fills_in_the_rest() -> None:
 
 @pytest.mark.parametrize("name", ["depot", "tasks", "values", "max_distance", "task_mask"])
 def test_masked_arrays_are_refused(name: str) -> None:
-    """What is masked is not a number; nothing masked is as good as no mask."""
+    """A masked entry is not a number; an array without masked entries is accepted."""
     masked = np.ma.array(arrays()[name])
     assert_equal(Instances.from_arrays(**arrays(**{name: masked})), Instances.from_arrays(**arrays()))
     masked[1] = np.ma.masked
@@ -109,7 +109,7 @@ def test_instances_with_gradients_are_saved(small: Instances, tmp_path: Path) ->
 
 
 def test_from_arrays_copies() -> None:
-    """Writing into the arrays afterwards, or into the instances, reaches neither."""
+    """Later writes to the arrays do not change the instances, and vice versa."""
     given_arrays = arrays()
     before = {name: np.copy(array) for name, array in given_arrays.items()}
     instances = Instances.from_arrays(**given_arrays)
@@ -155,7 +155,7 @@ def test_a_number_without_dimensions_selects_a_batch_of_one(one: Any, small: Ins
 
 
 def test_rows_in_the_order_of_a_permutation(small: Instances) -> None:
-    """``for k in torch.randperm(n)``, as training loops have it."""
+    """``for k in torch.randperm(n)``, as in training loops."""
     order = th.randperm(3, generator=th.Generator().manual_seed(0))
     rows = [small[k] for k in order]
     assert [len(row) for row in rows] == [1, 1, 1]
@@ -170,7 +170,7 @@ def test_slices_may_run_backwards(small: Instances) -> None:
 
 @pytest.mark.parametrize("nothing", [[], (), np.array([]), th.tensor([]), slice(0, 0), th.zeros(3, dtype=th.bool), range(0)])
 def test_an_empty_selection_is_an_empty_batch(nothing: Any, small: Instances, tmp_path: Path) -> None:
-    """It works where nothing is a sensible answer, and says what is wrong elsewhere."""
+    """It works where an empty result makes sense, and raises a clear error elsewhere."""
     empty = small[nothing]
     empty.validate()
     assert (len(empty), empty.n_tasks, empty.n_uavs) == (0, 5, 2) and list(empty) == []  # type: ignore[call-overload]
@@ -196,8 +196,8 @@ def test_joining_nothing_is_refused() -> None:
 
 
 @pytest.mark.parametrize("bad", [True, 1.0, [0.0, 1.0], [[0, 1]], [True, False], th.tensor(True), np.zeros((1, 1), dtype=int)])
-def test_what_selects_no_rows_is_refused(bad: Any, small: Instances) -> None:
-    with pytest.raises(IndexError, match="selects no instances; give row numbers, or 3 bools"):
+def test_other_indices_are_refused(bad: Any, small: Instances) -> None:
+    with pytest.raises(IndexError, match="is not a selection of instances; use row numbers, or 3 bools"):
         small[bad]
 
 
@@ -250,7 +250,7 @@ def test_to(small: Instances) -> None:
 
 
 def test_reachable() -> None:
-    """There and back within D, the border included; padded tasks never."""
+    """There and back within D, inclusive; padded tasks never are."""
     instances = Instances.from_arrays(
         depot=[0, 0], tasks=[[0.3, 0.4], [0.5, 0], [0.50001, 0], [0, 0]], max_distance=1.0, task_mask=[1, 1, 1, 0]
     )
@@ -259,7 +259,7 @@ def test_reachable() -> None:
 
 
 def test_digests_stay_as_result_files_store_them(small: Instances) -> None:
-    """Folders of results and zips hold them: another digest would refuse to resume."""
+    """Result folders and zips store them: with other digests, runs could not be resumed."""
     padded = small.pad(6)
     assert padded.digest() == "5041946ddb479bdcd8c81de0fbcb11b71e74f3f94983f89d4d1538fee057d250"
     assert fingerprint(padded, 3) == "ebed545e3f447bcc"

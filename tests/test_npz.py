@@ -1,4 +1,4 @@
-"""Damaged and hostile ``.npz`` files: an error that names file and array, and no memory that the file could not fill."""
+"""Damaged and hostile ``.npz`` files: errors name file and array, and no memory is allocated for data that is not there."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
     [
         (
             npy(HEADER.format("'<f8'", "(1000000000000,)"), bytes(96)),
-            r"promises float64 of shape \(1000000000000,\), but 96 byt",
+            r"declares float64 of shape \(1000000000000,\), but 96 byt",
         ),
         (
             npy(HEADER.format("'<f8'", "(2, 3, 200)"), bytes(96)),
-            r"promises float64 of shape \(2, 3, 200\), but 96 bytes follow",
+            r"declares float64 of shape \(2, 3, 200\), but 96 bytes follow",
         ),
-        (npy(HEADER.format("'<f8'", "(2, 3)"), bytes(96)), r"promises float64 of shape \(2, 3\), but 96 bytes follow"),
-        (npy(HEADER.format("'<f8'", "(-2, 3, 2)"), bytes(96)), r"promises float64 of shape \(-2, 3, 2\)"),
+        (npy(HEADER.format("'<f8'", "(2, 3)"), bytes(96)), r"declares float64 of shape \(2, 3\), but 96 bytes follow"),
+        (npy(HEADER.format("'<f8'", "(-2, 3, 2)"), bytes(96)), r"declares float64 of shape \(-2, 3, 2\)"),
         (npy(HEADER.format("'<f8'", "(-2, -3, 2)"), bytes(96)), ""),
-        (npy(HEADER.format("'<f8'", f"({10**400},)"), bytes(96)), "promises float64 of shape"),
+        (npy(HEADER.format("'<f8'", f"({10**400},)"), bytes(96)), "declares float64 of shape"),
         (npy(HEADER.format("('<f8', (10**9,))", "(2,)"), bytes(96)), ""),
-        (npy(HEADER.format("('<f8', (100000000,))", "(2,)"), bytes(96)), "promises "),
-        (npy(HEADER.format("'V0'", "(10,)")), "promises "),
-        (npy(HEADER.format("'<U0'", "(1000000000000,)")), "promises "),
+        (npy(HEADER.format("('<f8', (100000000,))", "(2,)"), bytes(96)), "declares "),
+        (npy(HEADER.format("'V0'", "(10,)")), "declares "),
+        (npy(HEADER.format("'<U0'", "(1000000000000,)")), "declares "),
         (npy(HEADER.format("('<f8',)", "(2,)"), bytes(96)), ""),
         (npy(HEADER.format("'O'", "(2,)"), bytes(96)), "Object arrays cannot be loaded"),
         (npy(HEADER.format("'<f8'", "2"), bytes(96)), "shape is not valid"),
@@ -79,21 +79,21 @@ def test_damaged_headers_name_file_and_array(content: bytes, message: str, tmp_p
     try:
         with pytest.raises(ValueError, match=rf"plan\.npz: not an intact \.npz of plain arrays \(array 'tasks': .*{message}"):
             Instances.load(path)
-        # The deepest headers cost numpy's parser this much.
+        # numpy's parser needs this much for the most deeply nested headers.
         assert tracemalloc.get_traced_memory()[1] < 32 * 2**20
     finally:
         tracemalloc.stop()
 
 
 def test_absurd_sizes_in_the_archive_are_refused(tmp_path: Path) -> None:
-    """Archive and header agree on 8 TB, which the few bytes of the file cannot hold."""
+    """Archive and header may agree on a size that the few bytes of the file cannot hold."""
     path = with_tasks(tmp_path / "plan.npz", npy(HEADER.format("'<f8'", "(1000000000,)"), bytes(96)))
     size = len(npy(HEADER.format("'<f8'", "(1000000000,)"))) + 8 * 10**9
     content = path.read_bytes()
     with zipfile.ZipFile(path) as file:
         start = file.getinfo("tasks.npy").header_offset
         found = file.getinfo("tasks.npy").file_size
-    # A size of four bytes: below 4 GB as zip files have it, and still absurd.
+    # Sizes in plain zip files are below 4 GB, which is still absurd here.
     size = min(size, 2**32 - 2)
     content = content.replace(struct.pack("<I", found), struct.pack("<I", size))
     assert struct.pack("<I", size) in content[start:]
@@ -116,7 +116,7 @@ def test_other_compressions_and_other_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_intact_files_are_read(save: object, tmp_path: Path) -> None:
-    """Of every plain dtype, shape and memory order; highly compressed ones too."""
+    """With every plain dtype, shape and memory order, and highly compressed."""
     rng = np.random.default_rng(0)
     expected = {
         "zeros": np.zeros((500, 500)),
@@ -136,7 +136,7 @@ def test_intact_files_are_read(save: object, tmp_path: Path) -> None:
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(position=st.floats(0, 1, exclude_max=True), flips=st.binary(min_size=1, max_size=3))
 def test_any_damage_to_a_header_is_a_value_error(position: float, flips: bytes, tmp_path: Path) -> None:
-    """In an uncompressed file, where checksums come after the header was read."""
+    """In every part of the header, which is read before the checksum is verified."""
     buffer = io.BytesIO()
     np.save(buffer, arrays()["tasks"])
     content = bytearray(buffer.getvalue())

@@ -20,7 +20,7 @@ from sb3_uav.envs.render import MapFigure, legend_lines
 
 @both_levels
 def test_rgb_array(level: str) -> None:
-    """A picture that changes from step to step and from episode to episode, the same for the same episode."""
+    """Pictures differ between steps and between episodes, and are equal for equal episodes."""
     env = make(level, n_tasks=5, max_distance=3.0, render_mode="rgb_array")
 
     def images() -> list[np.ndarray]:
@@ -46,7 +46,7 @@ def test_rgb_array(level: str) -> None:
 
 @both_levels
 def test_human_mode_without_a_display(level: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Says once that nothing is shown, plays on, and leaves no figure behind."""
+    """One warning that nothing is shown; the episode continues, and no figure remains open."""
     import matplotlib.pyplot as plt
 
     env = make(level, n_tasks=4, render_mode="human")
@@ -79,7 +79,7 @@ def test_drawing_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @both_levels
 def test_images_of_rows(level: str) -> None:
-    """One per row, as the single environment draws it; tiled by ``render``."""
+    """One per row, equal to that of a single environment; ``render`` tiles them."""
     fns = env_fns(level, 2, n_tasks=4, render_mode="rgb_array")
     ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
     assert ours.metadata == {"render_modes": ["human", "rgb_array"]}
@@ -110,7 +110,7 @@ def test_no_images_without_a_render_mode(level: str) -> None:
 
 
 def test_rows_in_human_mode_without_a_display() -> None:
-    """Does not crash, and leaves no figure behind."""
+    """It does not fail, and no figure remains open."""
     import matplotlib.pyplot as plt
 
     env = batched_env("routing", 2, n_tasks=4, render_mode="human")
@@ -154,7 +154,7 @@ def test_a_running_tour_is_open() -> None:
 
 
 def test_assigned_tasks_are_no_tour_yet() -> None:
-    """Nobody flies while tasks are assigned; tours and what they skip are known at the end."""
+    """No UAV flies while tasks are assigned; tours and skipped tasks are known at the end."""
     env = TaskAllocationEnv(n_tasks=3, n_uavs=2)
     instance = Instances.from_arrays([0, 0], [[0, 3], [4, 0], [100, 0]], max_distance=9.0, n_uavs=2)
     env.reset(options={"instance": instance})

@@ -1,4 +1,4 @@
-"""``BatchedVecEnv`` in the hands of SB3: monitors, wrappers, evaluation and training."""
+"""``BatchedVecEnv`` with SB3: monitors, wrappers, evaluation and training."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def test_monitor_file_holds_the_episodes_of_all_rows(env_id: str, tmp_path: Path
 
 
 def test_plots_of_monitor_files_show_the_true_time_steps(tmp_path: Path) -> None:
-    """PPO took 4 x 64 x 3 steps; SB3's plots count those of complete episodes, of all rows."""
+    """SB3's plots count the steps of all complete episodes of all rows."""
     folder = str(tmp_path)
     env = make_vec_env("RoutePlanning-N20-v0", n_envs=4, monitor_dir=folder, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
     model = PPO("MultiInputPolicy", env, n_steps=64, batch_size=64, n_epochs=1, seed=0, policy_kwargs={"net_arch": [8]})
     model.learn(4 * 64 * 3)
     env.close()
     steps, _ = ts2xy(load_results(folder), X_TIMESTEPS)
-    # In each row the last episode may be under way.
+    # The last episode of each row may be incomplete.
     assert model.num_timesteps == 768 and 768 - 4 * 20 <= steps[-1] <= 768
 
 
@@ -95,7 +95,7 @@ def test_vec_monitor(level: str, tmp_path: Path) -> None:
 
 @both_levels
 def test_vec_normalize(level: str) -> None:
-    """Rewards normalized, observations left alone, and the originals at hand."""
+    """Rewards are normalized, observations are not, and the original rewards remain available."""
     plain, inner = batched_env(level, 3, n_tasks=4), batched_env(level, 3, n_tasks=4)
     env = VecNormalize(inner, norm_obs=False)
     plain.seed(0)
@@ -113,7 +113,7 @@ def test_vec_normalize(level: str) -> None:
 
 
 class RandomPolicy:
-    """Any legal action, as observed."""
+    """Takes any legal action in the observation."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(0)

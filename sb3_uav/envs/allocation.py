@@ -1,4 +1,4 @@
-"""Task allocation (the paper's upper level): every task, one a step, is given to a UAV."""
+"""Task allocation (the paper's upper level): each step assigns one task to a UAV."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TASK_ORDERS = ("input", "sweep")
 
 class AllocationState(NamedTuple):
     """
-    :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` while it has none
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` if it has none yet
     :param task: ``(batch, n_samples)`` int64, index of the task to allocate next
     :param done: ``(batch, n_samples)`` bool, True when every real task has a UAV
     :param action_mask: ``(batch, n_samples, n_uavs)`` bool; any UAV may take any task
@@ -39,7 +39,7 @@ class AllocationDynamics(Dynamics):
     """
     Transitions of task allocation (paper, section IV-A1).
 
-    The one reward, at the end, is the value of the tasks that the router's tours visit.
+    The only reward, at the end, is the total value of the tasks on the router's tours.
 
     :param instances: The instances
     :param router: Plans the tours of the reward
@@ -58,7 +58,7 @@ class AllocationDynamics(Dynamics):
             assignment=th.full((batch_size, n_samples, n_tasks), UNASSIGNED, dtype=th.int64, device=device),
             task=task,
             done=task >= self._n_real,
-            # Expanded, because a fleet may be absurdly large.
+            # Expanded, as the fleet may be absurdly large.
             action_mask=th.ones(1, dtype=th.bool, device=device).expand(batch_size, n_samples, self.instances.n_uavs),
         )
 
@@ -80,7 +80,7 @@ class AllocationDynamics(Dynamics):
 
 class Subsets(NamedTuple):
     """
-    :param instances: ``batch * n_samples * n_uavs`` single-UAV instances, one for every UAV of every allocation
+    :param instances: ``batch * n_samples * n_uavs`` single-UAV instances, one per UAV of each allocation
     :param task_index: ``(batch * n_samples * n_uavs, n_slots)`` int64, the task of the original instance in each slot
     """
 
@@ -90,7 +90,7 @@ class Subsets(NamedTuple):
 
 def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     """
-    Cut instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
+    Split instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64; tasks with ``UNASSIGNED`` and padded tasks are left out
@@ -137,12 +137,12 @@ class PlannedTours(NamedTuple):
 
 def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> PlannedTours:
     """
-    Let the router plan every UAV's tour over the tasks it was given.
+    Plan every UAV's tour over its assigned tasks with a router.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
-    :return: The tours and what they collect
+    :return: The tours and the value that they collect
     """
     shape = (*assignment.shape[:2], instances.n_uavs)
     subsets = split_tasks(instances, assignment)
@@ -154,12 +154,12 @@ def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> P
 
 def useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
     """
-    Leave out the UAVs that no allocation can use, so that an absurdly large fleet costs no memory.
+    Remove UAVs that cannot have a task, so that an absurdly large fleet takes no memory.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
-    :return: Both as they are if there are no more UAVs than tasks. Otherwise the instances with one UAV per task, and the
-        assignment with the UAVs that have tasks numbered from 0, in the same order
+    :return: Both unchanged if there are at most as many UAVs as tasks. Otherwise the instances with one UAV per task, and the
+        assignment with the UAVs that have tasks renumbered from 0 in the same order
     """
     if instances.n_uavs <= instances.n_tasks:
         return instances, assignment
@@ -176,7 +176,7 @@ def planned_value(instances: Instances, assignment: th.Tensor, router: Router) -
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
-    :return: ``(batch, n_samples)`` float64, what the planned tours collect, whatever the size of the fleet
+    :return: ``(batch, n_samples)`` float64, total value of the tasks on the planned tours
     """
     return plan_tours(*useful_allocation(instances, assignment), router).value
 
@@ -191,12 +191,12 @@ def schedules(tours: th.Tensor) -> list[Schedule]:
 
 class AllocationProblem(Problem):
     """
-    Task allocation: one task is given to a UAV per step; the reward comes at the end.
+    Task allocation: each step assigns one task to a UAV; the reward comes at the end.
 
     :param generator: Draws the instances
     :param router: Plans the tours of the reward; nearest feasible task when None
-    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot
-    :raises ValueError: If there is no such order
+    :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot
+    :raises ValueError: If the order is unknown
     """
 
     running_stage = Stage.ASSIGNING
@@ -208,7 +208,7 @@ class AllocationProblem(Problem):
 
     @property
     def task_order(self) -> str:
-        """In which order the tasks are shown."""
+        """The order in which the tasks are presented."""
         return self._task_order
 
     @task_order.setter
@@ -232,7 +232,7 @@ class AllocationProblem(Problem):
         }
 
     def dynamics(self, instances: Instances) -> AllocationDynamics:
-        # Looked up at every step, so that a router set during an episode is used.
+        # Looked up at every call, so that a router set during an episode takes effect.
         return AllocationDynamics(instances, lambda subsets: self.router(subsets))
 
     def observe(self, dynamics: AllocationDynamics, state: AllocationState) -> dict[str, th.Tensor]:
@@ -251,14 +251,14 @@ class AllocationProblem(Problem):
         return rewards.scatter(-1, last[..., None], returns[..., None])
 
     def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        # An instance without tasks is over only after a first step, which finds nothing to do.
+        # An instance without tasks ends only after a first step that does nothing.
         return instances.task_mask.sum(1).clamp(min=1)[:, None].expand(actions.shape[:2])
 
     def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
         assignment = np.full((1, 1, instance.n_tasks), UNASSIGNED)
         assignment[0, 0, : len(actions)] = actions
         instance, allocation = useful_allocation(instance, th.from_numpy(assignment))
-        # Until the end there are no tours: these are the tasks of each UAV, in the order in which it got them.
+        # There are no tours before the end: these are the tasks of each UAV, in the order of their assignment.
         if len(actions) < int(instance.task_mask.sum()):
             uavs = allocation[0, 0].tolist()
             return [[task for task, uav in enumerate(uavs) if uav == v] for v in range(instance.n_uavs)]
@@ -276,8 +276,8 @@ class TaskAllocationEnv(ProblemEnv):
     :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
-    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot, which allocators
-        with ``sweep`` expect
+    :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot, which
+        allocators with ``sweep`` expect
     :param router: Plans the tours of the reward; nearest feasible task when None
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
     """
@@ -300,9 +300,9 @@ class TaskAllocationEnv(ProblemEnv):
         super().__init__(AllocationProblem(generator, router, task_order), render_mode)
 
     def set_router(self, router: Router) -> None:
-        """Use another router from the next reward on."""
+        """Use another router, starting with the next reward."""
         self.problem.router = router
 
     def set_task_order(self, task_order: str) -> None:
-        """Show the tasks of the next episodes in another order."""
+        """Present the tasks of the next episodes in another order."""
         self.problem.task_order = task_order

@@ -1,4 +1,4 @@
-"""Turning what users pass as arrays, row numbers and names of arrays into what instances hold, with errors that help."""
+"""Conversion of user input (arrays, row numbers, names of arrays) for instances, with helpful errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-# What others call the arrays of an instance file, in small letters and without underscores.
+# Other common names of the arrays of an instance file, in lower case and without underscores.
 _SYNONYMS = {
     "depot": "depots base home start origin launch",
     "tasks": "task customers nodes points targets locations locs positions coordinates coords xy sites cities",
@@ -24,7 +24,7 @@ def advice_on(name: str, known: Sequence[str]) -> str:
     """
     :param name: Name of an unknown array
     :param known: Names of the known ones
-    :return: The known name that is probably meant, or all of them
+    :return: Advice that names the array that was probably meant, or all known ones
     """
     plain = name.lower().replace("_", "").replace("-", "").replace(" ", "")
     meant = [field for field, synonyms in _SYNONYMS.items() if plain in synonyms.split()]
@@ -36,14 +36,14 @@ def advice_on(name: str, known: Sequence[str]) -> str:
 
 def row_index(rows: Any, n_rows: int, device: th.device) -> slice | th.Tensor:
     """
-    :param rows: What was given to ``Instances.__getitem__``
+    :param rows: The argument of ``Instances.__getitem__``
     :param n_rows: Number of rows
     :param device: Where the rows are
-    :return: The same for a tensor's first dimension
-    :raises IndexError: If there is no such row, or ``rows`` is no selection of rows
+    :return: An index into the first dimension of a tensor
+    :raises IndexError: If there is no such row, or ``rows`` does not select rows
     """
     if isinstance(rows, slice):
-        # Tensors know no negative steps.
+        # Tensors do not support negative steps.
         return rows if rows.step is None or rows.step > 0 else th.tensor(range(n_rows)[rows], dtype=th.int64, device=device)
     if isinstance(rows, th.Tensor):
         index = rows.to(device)
@@ -52,7 +52,7 @@ def row_index(rows: Any, n_rows: int, device: th.device) -> slice | th.Tensor:
     if index.numel() == 0 and index.ndim == 1:
         index = index.to(th.int64)
     if index.is_floating_point() or index.ndim > 1 or (index.dtype == th.bool and index.shape != (n_rows,)):
-        raise IndexError(f"{rows!r:.80} selects no instances; give row numbers, or {n_rows} bools.")
+        raise IndexError(f"{rows!r:.80} is not a selection of instances; use row numbers, or {n_rows} bools.")
     if index.ndim == 0:
         row = int(index)
         if not -n_rows <= row < n_rows:
@@ -63,12 +63,18 @@ def row_index(rows: Any, n_rows: int, device: th.device) -> slice | th.Tensor:
 
 
 def as_numbers(name: str, array: Any, source: str) -> np.ndarray:
-    """A float64 copy of anything that holds real numbers; the error names the field."""
+    """
+    :param name: Name of the field, for errors
+    :param array: Anything that holds real numbers; gradients are dropped
+    :param source: Where it comes from, for errors
+    :return: A float64 copy
+    :raises ValueError: If it is not an array of real numbers, or has masked entries
+    """
     try:
         if isinstance(array, th.Tensor):
             array = array.detach().cpu()
             array = array.double() if array.is_floating_point() else array
-        # np.asarray would drop the masks of masked arrays, also of those in a list.
+        # np.asarray would drop the masks of masked arrays, including masked arrays in a list.
         found = np.ma.asarray(array) if isinstance(array, list | tuple) else np.asanyarray(array)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{source}: field '{name}' must be an array of real numbers: {error}") from error
@@ -86,7 +92,13 @@ def as_numbers(name: str, array: Any, source: str) -> np.ndarray:
 
 
 def per_instance(name: str, array: Any, batch_size: int, source: str) -> np.ndarray:
-    """``(batch_size,)`` float64, from as many numbers or from one for all."""
+    """
+    :param name: Name of the field, for errors
+    :param array: One number per instance, or one for all
+    :param batch_size: Number of instances
+    :param source: Where it comes from, for errors
+    :return: ``(batch_size,)`` float64
+    """
     numbers = as_numbers(name, array, source)
     if numbers.shape not in ((), (1,), (batch_size,)):
         raise ValueError(f"{source}: field '{name}' has shape {numbers.shape}, expected ({batch_size},).")

@@ -17,13 +17,13 @@ from sb3_uav.common.npz import read_npz
 from sb3_uav.envs.array_input import advice_on, as_numbers, per_instance, row_index
 from sb3_uav.envs.distances import distance_limit, euclidean
 
-# From how many maximum flight distances on a depot is far from the origin: float32 still keeps 1e-5 of that distance there.
+# A depot is far from the origin beyond this many maximum flight distances, of which float32 still resolves 4e-6 there.
 FAR_FROM_ORIGIN = 64.0
 
-# Greater numbers of UAVs are mistakes: they would not fit the integers of files and solvers.
+# Larger fleets would not fit the integers of files and solvers.
 MAX_UAVS = 2**31 - 1
 
-# The tensors of Instances. Digests are taken in this order, and files of results store digests.
+# The tensors of Instances. The order matters for digests, which result files store.
 TENSOR_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 
 
@@ -32,16 +32,16 @@ class Instances:
     """
     A batch of problem instances: one depot, ``n_tasks`` tasks and ``n_uavs`` identical UAVs each.
 
-    All numbers are float64, whatever they were made from, so that feasibility is decided at that precision. Coordinates that
-    were float32 before keep that rounding: give float64 ones, above all far from the origin. Networks work on float32 copies
-    of :meth:`near_origin`.
-    Rows with fewer tasks are padded at the end, and ``task_mask`` says which tasks are real. The constructor checks shapes
-    only, because the hot loops build subsets by the thousand; :meth:`validate` checks the contents, and
-    :meth:`from_arrays` and :meth:`load` call it.
+    All numbers are float64, so that feasibility is decided at that precision. Coordinates converted from float32 keep their
+    rounding errors: pass float64 coordinates, especially far from the origin. Networks use float32 copies of
+    :meth:`near_origin`.
+    Rows with fewer tasks are padded at the end, and ``task_mask`` marks the real tasks. The constructor checks only shapes,
+    because the hot loops build subsets by the thousand; :meth:`validate` checks the contents, and :meth:`from_arrays` and
+    :meth:`load` call it.
 
     :param depot: ``(batch, 2)``
     :param tasks: ``(batch, n_tasks, 2)``
-    :param values: ``(batch, n_tasks)``, the prize of each task
+    :param values: ``(batch, n_tasks)``, the value of each task
     :param max_distance: ``(batch,)``, the longest tour a UAV can fly (the paper's D), in the unit of the coordinates
     :param n_uavs: Number of UAVs (the paper's V), the same for all rows
     :param task_mask: ``(batch, n_tasks)`` bool, False where a row is padded
@@ -87,7 +87,7 @@ class Instances:
         :param max_distance: ``(batch,)`` or a number
         :param n_uavs: ``(batch,)``, all the same, or a number
         :param task_mask: ``(batch, n_tasks)`` bool; all True when None
-        :param source: What the arrays were read from, named in errors
+        :param source: Where the arrays come from, named in errors
         :return: The instances, float64 on the CPU
         :raises ValueError: If a shape or a value is not allowed; the message names the field and what was found
         """
@@ -104,11 +104,11 @@ class Instances:
         if batch_size < 1 or n_tasks < 1:
             raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}; give at least one instance with one task.")
         if task_mask is not None and not np.isin(task_mask, (0, 1)).all():
-            raise ValueError(f"{source}: field 'task_mask' holds other things than True and False.")
+            raise ValueError(f"{source}: field 'task_mask' holds values other than True and False.")
         uavs = np.unique(per_instance("n_uavs", n_uavs, batch_size, source))
         if len(uavs) != 1:
             found = ", ".join(f"{n:g}" for n in uavs)
-            raise ValueError(f"{source}: field 'n_uavs' mixes {found}; store each fleet size in a file of its own.")
+            raise ValueError(f"{source}: field 'n_uavs' mixes {found}; store each fleet size in a separate file.")
         if not float(uavs[0]).is_integer() or not 1 <= uavs[0] <= MAX_UAVS:
             raise ValueError(
                 f"{source}: field 'n_uavs' is {uavs[0]:g}, but a fleet has a whole number of UAVs, at least 1, "
@@ -135,9 +135,9 @@ class Instances:
         """
         Check the contents.
 
-        :raises ValueError: On NaN or infinite numbers, a negative value, values whose sum is infinite, ``max_distance <= 0``,
-            fewer than one UAV, padding that is not at the end of its row, or another dtype than float64; the message names
-            the field, the row and the value found
+        :raises ValueError: If a number is NaN or infinite, a value is negative, the sum of the values is infinite,
+            ``max_distance <= 0``, there is no UAV, padding is not at the end of its row, or a dtype is not float64; the
+            message names the field, the row and the value found
         """
         if self.task_mask.dtype != th.bool:
             raise ValueError(f"field 'task_mask' has dtype {self.task_mask.dtype}; it must be bool.")
@@ -187,7 +187,7 @@ class Instances:
 
     @property
     def useful_fleet(self) -> int:
-        """How many of the UAVs can be of use: a UAV without a task stays in the depot, and a fleet may be absurdly large."""
+        """Number of UAVs that can be of use, at most one per task; allocate memory for these only."""
         return min(self.n_uavs, max(self.n_tasks, 1))
 
     def __len__(self) -> int:
@@ -197,8 +197,8 @@ class Instances:
         """
         Select rows.
 
-        :param rows: An integer, also a tensor without dimensions, for a batch of one; a slice; any sequence, array or tensor
-            of row numbers, possibly empty; or one bool per row
+        :param rows: An integer (or 0-d array or tensor) for a batch of one; a slice; a sequence, array or tensor of row
+            numbers, possibly empty; or one bool per row
         :return: The selected rows, a view where ``rows`` is an integer or a slice with a positive step
         :raises IndexError: If there is no such row, or ``rows`` is none of these
         """
@@ -206,7 +206,7 @@ class Instances:
         return self._map(lambda field: field[index])
 
     def to(self, device: th.device | str) -> Instances:
-        """Copy to ``device``; returns ``self`` when it is there already."""
+        """Copy to ``device``; returns ``self`` if it is already there."""
         if self.device == th.device(device):
             return self
         return self._map(lambda field: field.to(device))
@@ -218,7 +218,7 @@ class Instances:
 
     def replace_rows(self, rows: th.Tensor, others: Instances) -> Instances:
         """
-        Put other instances of the same size in the place of some rows.
+        Replace some rows by other instances of the same size.
 
         :param rows: ``(n,)`` int64, the rows to replace
         :param others: ``n`` instances
@@ -240,9 +240,10 @@ class Instances:
 
     def reorder(self, order: th.Tensor) -> Instances:
         """
-        Put the tasks into another order.
+        Reorder the tasks.
 
-        :param order: ``(batch, n_tasks)`` int64, which task comes first, second, ...; padded tasks stay at the end
+        :param order: ``(batch, n_tasks)`` int64, the index of the task in each place; padded tasks stay at the end
+        :return: The instances, tasks in the new order
         """
         return replace(
             self,
@@ -282,9 +283,9 @@ class Instances:
 
     def digest(self, header: str | None = None) -> str:
         """
-        SHA-256 of the contents, by which equal instances are recognized.
+        SHA-256 of the contents. Equal instances have equal digests.
 
-        :param header: What is hashed before the tensors; number of UAVs, batch size and number of tasks when None
+        :param header: Text hashed before the tensors; number of UAVs, batch size and number of tasks when None
         :return: 64 hexadecimal digits
         """
         header = f"{self.n_uavs} {tuple(self.task_mask.shape)}\n" if header is None else header
@@ -295,12 +296,13 @@ class Instances:
 
     def near_origin(self) -> Instances:
         """
-        Move the depots that lie far from the origin, in proportion to the maximum flight distance, to the origin.
+        Translate each row whose depot is far from the origin, relative to the maximum flight distance, so that its depot is at
+        the origin.
 
-        Coordinates of 1e7 keep only one digit before the point in float32. What becomes float32 must come from here, so that
-        networks see the same instance wherever it lies. Instances near the origin, as those of the paper, stay as they are.
+        float32 resolves coordinates around 1e7 only to whole units. Call this before converting to float32, so that a
+        network's input does not depend on where the instance lies. Rows near the origin, such as the paper's, stay bit-equal.
 
-        :return: The instances, the same positions relative to the depot up to the rounding of float64
+        :return: The translated instances
         """
         is_far = self.depot.abs().amax(1) > FAR_FROM_ORIGIN * self.max_distance
         shift = self.depot.where(is_far[:, None], 0.0)
@@ -342,7 +344,7 @@ class Instances:
         :param path: The file
         :return: The validated instances
         :raises FileNotFoundError: If there is no such file
-        :raises ValueError: If the file is not an intact ``.npz``, misses an array, holds others, or bad numbers
+        :raises ValueError: If the file is not an intact ``.npz``, lacks an array, holds an unknown array, or holds bad numbers
         """
         path = Path(path)
         if not path.is_file():
@@ -351,7 +353,7 @@ class Instances:
         known = (*TENSOR_FIELDS, "n_uavs")
         unknown = [name for name in arrays if name not in known]
         if unknown:
-            raise ValueError(f"{path}: array '{unknown[0]}' is not a part of instances; {advice_on(unknown[0], known)}.")
+            raise ValueError(f"{path}: unknown array '{unknown[0]}'; {advice_on(unknown[0], known)}.")
         missing = {"depot", "tasks", "max_distance", "n_uavs"} - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")

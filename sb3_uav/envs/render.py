@@ -1,4 +1,4 @@
-"""Schedules and running episodes on a map. No other module of the environments needs matplotlib."""
+"""Maps of schedules and of running episodes. matplotlib is imported when it is first used."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from sb3_uav.envs.problem import Stage
 logger = logging.getLogger(__name__)
 
 # Okabe and Ito's palette, readable with color-vision deficiencies.
-UAV_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C6D31", "#000000")
+UAV_COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C6D31", "#000000")
 
-# What the legend says of the tasks that no route holds.
+# Legend entries of the tasks that are on no route.
 REMAINING_TASKS = {Stage.ASSIGNING: "not yet assigned", Stage.FLYING: "not yet visited", Stage.FINISHED: "skipped"}
 # The legend of a larger fleet would not fit below the map.
 MAX_UAVS_NAMED = 12
@@ -54,17 +54,17 @@ def draw_map(
     stage: Stage = Stage.FINISHED,
 ) -> None:
     """
-    Draw the depot, the tasks colored by UAV and the others as hollow circles, on a square of the plane that holds all points.
+    Draw a square map of the depot, the tasks of each UAV in its color, and the other tasks as hollow circles.
 
-    Tours are closed when the episode is finished, end where the UAV is while it flies, and are not drawn while tasks are still
-    being assigned, because nobody has planned them yet.
+    Tours are closed if the episode is finished, and end at the UAV's position while it flies. While tasks are being assigned
+    there are no tours to draw.
 
     :param axes: matplotlib axes
     :param instances: The instances
-    :param row: Which of them
+    :param row: Index of the instance
     :param routes: Task indices from 0 per UAV
     :param title: Title of the axes
-    :param stage: How far the episode is
+    :param stage: Stage of the episode
     """
     depot = instances.depot[row].numpy()
     tasks = instances.tasks[row][instances.task_mask[row]].numpy()
@@ -73,7 +73,7 @@ def draw_map(
     for uav, route in enumerate(routes):
         if len(route) == 0 and uav not in named:
             continue
-        color = UAV_COLOURS[uav % len(UAV_COLOURS)]
+        color = UAV_COLORS[uav % len(UAV_COLORS)]
         points = tasks[list(route)]
         label = f"UAV {uav + 1}: {_counted(len(points))}, {_distances(depot, points, maximum, stage)}"
         label = label if uav in named else "_nolegend_"
@@ -115,7 +115,7 @@ def _named_uavs(routes: Sequence[Sequence[int]]) -> set[int]:
 
 
 def _distances(depot: np.ndarray, points: np.ndarray, maximum: float, stage: Stage) -> str:
-    """What the legend says of a UAV's distances."""
+    """The distances of a UAV, for the legend."""
     path = np.vstack([depot, points, depot] if stage is Stage.FINISHED else [depot, points])
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) if stage is not Stage.ASSIGNING else 0.0
     if stage is Stage.FINISHED:
@@ -125,14 +125,14 @@ def _distances(depot: np.ndarray, points: np.ndarray, maximum: float, stage: Sta
 
 
 def _rounded(distance: float, maximum: float) -> str:
-    """Two digits after the point if the maximum flight distance is of ordinary magnitude, else three in all."""
+    """Two decimals if the maximum flight distance is of ordinary magnitude, otherwise three significant digits."""
     return f"{distance:.2f}" if 0.1 <= maximum < 1e6 else f"{distance:.3g}"
 
 
 def _set_limits(axes: Any, points: np.ndarray) -> None:
     """Show a square around the points, without ticks."""
     low, high = points.min(0), points.max(0)
-    # Of one point, any square will do.
+    # Any size will do for a single point.
     half = BORDER * float((high - low).max() or 1.0) / 2
     for set_limits, middle in zip((axes.set_xlim, axes.set_ylim), (low + high) / 2, strict=True):
         set_limits(middle - half, middle + half)
@@ -147,9 +147,9 @@ def _counted(n_tasks: int) -> str:
 
 class MapFigure:
     """
-    A figure that is drawn again at every step.
+    A figure that is redrawn at every step.
 
-    :param interactive: Whether to open a window; without a display nothing is shown, and that is said once
+    :param interactive: Whether to open a window; without a display, nothing is shown and a warning is logged once
     """
 
     def __init__(self, interactive: bool = False) -> None:
@@ -171,8 +171,8 @@ class MapFigure:
         """
         Replace what is drawn.
 
-        :param episodes: Episodes that have begun
-        :param row: Which of them
+        :param episodes: Running episodes
+        :param row: Index of the episode to draw
         """
         routes = episodes.routes(row)
         self.axes.clear()
@@ -196,7 +196,7 @@ class MapFigure:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def show(self) -> None:
-        """Bring the window up to date."""
+        """Update the window."""
         if self.interactive:
             import matplotlib.pyplot as plt
 

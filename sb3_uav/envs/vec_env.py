@@ -17,7 +17,7 @@ from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.problem import Problem
 
-# Wrappers that change nothing: episode statistics are kept below.
+# Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
 TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
 
 
@@ -27,7 +27,7 @@ def strip_wrappers(env: gym.Env) -> gym.Env:
     :return: What is left without the wrappers around it that change nothing, among them a time limit that no episode reaches
     """
     inner: Any = env
-    # Exact types only: a subclass may do something else.
+    # Only exact types: a subclass may behave differently.
     while type(inner) in TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
         inner = inner.env
     return inner
@@ -57,12 +57,12 @@ def _can_cut_off(limit: TimeLimit) -> bool:
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     """
     :param env: An environment
-    :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper around it changes what it does
+    :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper changes its behavior
     """
     inner = strip_wrappers(env)
     if not isinstance(inner, ProblemEnv):
         return None
-    # ProblemEnv's own methods only: a subclass may do something else.
+    # Only ProblemEnv's own methods: a subclass may behave differently.
     inherits = type(inner).step is ProblemEnv.step and type(inner).reset is ProblemEnv.reset
     return inner if inherits else None
 
@@ -71,12 +71,12 @@ class BatchedVecEnv(VecEnv):
     """
     A drop-in for ``DummyVecEnv`` that steps all its episodes with one batched tensor operation.
 
-    Seeded alike, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it says
-    what the problem is, and its ``Monitor``, if it has a file, logs the episodes of all rows, as a ``VecMonitor`` would. Every
-    episode's statistics are in ``infos[i]["episode"]``, as with ``Monitor``.
+    With the same seed, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it
+    defines the problem, and its ``Monitor``, if it has a file, logs the episodes of all rows, as ``VecMonitor`` does. The
+    statistics of an episode are in ``infos[i]["episode"]``, as with ``Monitor``.
 
     :param env_fns: Functions that make the environment, as for ``DummyVecEnv``; one per row
-    :raises ValueError: If the functions do not make one of our environments, or wrap it in something that changes it
+    :raises ValueError: If the functions do not make an environment of this package, or wrap it in something that changes it
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
@@ -148,16 +148,16 @@ class BatchedVecEnv(VecEnv):
         """
         Write a line to the monitor file, if there is one.
 
-        All rows write to one file, so that SB3's ``load_results`` and ``plot_results`` count all time steps.
+        All rows write to the same file, so that SB3's ``load_results`` and ``plot_results`` count all time steps.
 
-        :param episode_info: What :meth:`episode_info` returned, and the info keywords of the ``Monitor``
+        :param episode_info: The result of :meth:`episode_info`, and the info keywords of the ``Monitor``
         """
         if self._monitor is not None and self._monitor.results_writer is not None:
             self._monitor.results_writer.write_row(episode_info)
 
     @property
     def monitor_folder(self) -> str | None:
-        """Where the monitor file lies, if there is one."""
+        """Folder of the monitor file, if there is one."""
         if self._monitor is None or self._monitor.results_writer is None:
             return None
         return os.path.dirname(self._monitor.results_writer.file_handler.name)
@@ -208,7 +208,7 @@ class BatchedVecEnv(VecEnv):
             self._windows[row].show()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the one shared environment, once per row; ``instance`` differs from row to row."""
+        """The attribute of the shared environment, once per row; ``instance`` differs between rows."""
         rows = self._get_indices(indices)
         if attr_name == "instance":
             return [self.episodes.instances[row] for row in rows]
@@ -216,9 +216,9 @@ class BatchedVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
-        Set an attribute of the one shared environment.
+        Set an attribute of the shared environment.
 
-        :raises ValueError: If only some rows are named, because all rows share it
+        :raises ValueError: If only some rows are given, because all rows share the environment
         """
         self._require_all_rows(indices, f"set {attr_name}")
         setattr(self.template, attr_name, value)
@@ -227,9 +227,9 @@ class BatchedVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        Call a method of every row's environment; ``action_masks`` and ``render`` answer row by row.
+        Call a method of every row's environment; ``action_masks`` and ``render`` return results for each row.
 
-        :raises ValueError: If only some rows are named for a method that they share
+        :raises ValueError: If only some rows are given for a method of the shared environment
         """
         rows = list(self._get_indices(indices))
         if method_name == "action_masks":
@@ -247,7 +247,7 @@ class BatchedVecEnv(VecEnv):
         return [result for _ in rows]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """True for ``Monitor``, whose statistics this class provides; other wrappers are refused in the constructor."""
+        """True for ``Monitor``, whose statistics this class provides; the constructor refuses other wrappers."""
         return [issubclass(Monitor, wrapper_class) for _ in self._get_indices(indices)]
 
     def _require_all_rows(self, indices: VecEnvIndices, action: str) -> None:
