@@ -38,12 +38,15 @@ def test_features_are_finite_for_instances_of_any_magnitude(instances: Instances
     assert features.isfinite().all()
 
 
-def test_scaled_instances_have_the_same_features() -> None:
-    """Moved, and in another unit: the features are the same."""
+@pytest.mark.parametrize("offset", [7.0, 1e7])
+def test_scaled_instances_have_the_same_features(offset: float) -> None:
+    """Moved, far from the origin too, and in another unit: differences of coordinates are taken in float64."""
     instances = UniformGenerator(9, 2)(4, np.random.default_rng(0))
-    moved = Instances.from_arrays(7 + 3 * instances.depot.numpy(), 7 + 3 * instances.tasks.numpy(), max_distance=6.0, n_uavs=2)
-    for one, two in zip(FleetGeometry.of(static_of(instances)), FleetGeometry.of(static_of(moved)), strict=True):
-        th.testing.assert_close(one, two, atol=1e-5, rtol=0)
+    points = offset + 3 * instances.depot.numpy(), offset + 3 * instances.tasks.numpy()
+    moved = Instances.from_arrays(*points, max_distance=6.0, n_uavs=2)
+    for geometry in (FleetGeometry, MoveGeometry):
+        for one, two in zip(geometry.of(static_of(instances)), geometry.of(static_of(moved)), strict=True):
+            th.testing.assert_close(one, two, atol=1e-5, rtol=0)
 
 
 def test_features_of_a_move() -> None:
