@@ -1,7 +1,7 @@
 """
 Trains RL4CO's attention model in turns with ``training_throughput.py``, which starts this file with the Python of RL4CO.
 
-That environment need not have sb3_uav.
+That environment does not need sb3_uav.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import torch as th
 
 class Measurement(NamedTuple):
     """
-    :param n_instances: Instances learned from
-    :param seconds: How long it took
+    :param n_instances: Training instances
+    :param seconds: Duration in seconds
     :param cpu_seconds: CPU time of all threads
     :param mean_return: Mean return of the last episodes
     """
@@ -53,7 +53,7 @@ def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int
     :param num_threads: Threads of torch
     :param shape: Layers, width, heads and normalization
     """
-    # Whatever the libraries print must not get among the messages.
+    # Output of the libraries must not mix with the messages.
     messages = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     warnings.simplefilter("ignore")
@@ -65,7 +65,7 @@ def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int
     from rl4co.models import REINFORCE, AttentionModelPolicy  # type: ignore[import-not-found]
     from rl4co.utils import RL4COTrainer  # type: ignore[import-not-found]
 
-    # Not earlier: these imports set another number.
+    # After these imports, which change the number.
     th.set_num_threads(num_threads)
     th.manual_seed(0)
 
@@ -73,7 +73,7 @@ def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int
         """
         Trains in turns with the other competitors.
 
-        From the start of an epoch to that of the next are its updates and the instances of the next with their rollouts.
+        The time between the starts of two epochs includes the updates, and generating the next instances with their rollouts.
         """
 
         clock: Clock | None = None
@@ -83,7 +83,7 @@ def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int
                 return
             if self.clock is None:
                 assert th.get_num_threads() == num_threads
-                # No test of the baseline's policy from now on.
+                # Disable further tests of the baseline's policy.
                 model.baseline.epoch_callback = lambda *args, **kwargs: None
                 self._wait("ready")
                 return
@@ -103,7 +103,7 @@ def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int
             self.n_epochs, self.returns, self.clock = 0, list[float](), Clock()
 
     generator = OPGenerator(num_loc=n_tasks, max_length=max_distance, prize_type="const")
-    # RL4CO 0.7.0 looks there for the device of constant prizes but never sets it.
+    # RL4CO 0.7.0 reads the device of constant prizes there but never sets it.
     generator.device = "cpu"
     env = OPEnv(generator)
     policy = AttentionModelPolicy(

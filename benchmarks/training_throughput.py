@@ -1,8 +1,8 @@
 """
-How fast both levels train: instances and episodes per second of an epoch, against the paper's way and against RL4CO.
+Training speed of both levels: instances and episodes per second of an epoch, against the paper's method and RL4CO.
 
 An instance is one problem that contributes to one update; an episode is one sampled solution of it that enters the gradient.
-Greedy rollouts of a baseline are work but no episodes. Our shipped settings sample 8 episodes of every instance from one
+Greedy rollouts of a baseline do not count as episodes. Our shipped settings sample 8 episodes of every instance from one
 encoding, the others one, so both rates and both ratios are printed.
 
 ``default``
@@ -69,7 +69,7 @@ CONFIG = Path(__file__).parents[1] / "zoo_configs" / "reinforce.yml"
 # Entries of the configuration.
 ENTRIES = {"default": "TaskAllocation-Universal-v0", "paper": "paper-U4"}
 SHAPE = ("embed_dim", "n_layers", "n_heads", "ff_dim", "normalization")
-# Who is compared with whom, by level.
+# Compared competitors, by level.
 PAIRS = {
     "allocator": [("default", "paper")],
     "router": [
@@ -83,15 +83,15 @@ PAIRS = {
 
 
 class Competitor(Protocol):
-    """Something that learns."""
+    """A training that can be measured."""
 
     # Episodes per instance.
     n_samples: int
 
     def measure(self, seconds: float) -> Measurement:
         """
-        :param seconds: How long to learn at least, in whole epochs
-        :return: What was done
+        :param seconds: Minimum duration; whole epochs are trained
+        :return: The measurement
         """
         ...
 
@@ -141,7 +141,7 @@ def router_shape(name: str) -> dict[str, Any]:
 def padded_plan(router: RouterPolicy) -> Router:
     """
     :param router: A router
-    :return: What plans with it as the paper does: all subsets at once, as large as the largest of them
+    :return: A planner as in the paper: all subsets at once, padded to the largest
     """
     return lambda subsets: router.decode_episodes(subsets)[:, 0]
 
@@ -152,7 +152,7 @@ class Ours:
 
     :param level: ``"allocator"`` or ``"router"``
     :param name: ``"default"``, ``"paper"`` or ``"plain"``
-    :param args: Of the command line
+    :param args: Arguments of the command line
     """
 
     def __init__(self, level: str, name: str, args: argparse.Namespace) -> None:
@@ -199,8 +199,8 @@ class RL4CO:
     RL4CO's attention model, in a process of its own.
 
     :param shape: Layers, width, heads and normalization
-    :param args: Of the command line
-    :raises RuntimeError: If the process ends before it is asked to
+    :param args: Arguments of the command line
+    :raises RuntimeError: If the process ends early
     """
 
     n_samples = 1
@@ -210,7 +210,7 @@ class RL4CO:
         settings = {key: getattr(args, key) for key in keys}
         command = [args.rl4co, str(SERVER), json.dumps({**settings, **shape})]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        # Its first epoch, without rollouts, is over when it says so.
+        # It reports the end of its first epoch, which has no rollouts.
         self._receive()
 
     def _receive(self) -> Any:
@@ -265,8 +265,8 @@ def report(level: str, n_samples: dict[str, int], measured: dict[str, list[Measu
 
 def to_csv(rows: list[dict[str, Any]]) -> str:
     """
-    :param rows: One measurement each
-    :return: They as CSV
+    :param rows: Measurements
+    :return: The rows as CSV
     """
     stream = io.StringIO()
     writer = csv.DictWriter(stream, rows[0], lineterminator="\n")
@@ -278,7 +278,7 @@ def to_csv(rows: list[dict[str, Any]]) -> str:
 def compete(level: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     """
     :param level: ``"allocator"`` or ``"router"``
-    :param args: Of the command line
+    :param args: Arguments of the command line
     :return: Rows of the CSV
     """
     with ExitStack() as stack:
@@ -319,11 +319,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--max-distance", type=float, default=2.0)
     parser.add_argument("--batch-size", type=int, default=64, help="instances per update")
     parser.add_argument("--epoch-batches", type=int, default=4, help="updates per epoch")
-    parser.add_argument("--seconds", type=float, default=10.0, help="least duration of a measurement")
+    parser.add_argument("--seconds", type=float, default=10.0, help="minimum duration of a measurement")
     parser.add_argument("--rounds", type=int, default=3, help="measurements of every competitor")
     parser.add_argument("--num-threads", type=int, default=1)
     parser.add_argument("--rl4co", metavar="PYTHON", help="Python of an environment with RL4CO; without it, RL4CO is left out")
-    parser.add_argument("--out", type=Path, metavar="CSV", help="where to write the measurements")
+    parser.add_argument("--out", type=Path, metavar="CSV", help="output file of the measurements")
     args = parser.parse_args(arguments)
     print(
         f"N = {args.n_tasks}, V = {args.n_uavs}, D = {args.max_distance:g}, batches of {args.batch_size}, "

@@ -30,7 +30,7 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import DLDRL
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its import CHECKPOINT_FOLDER, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
 
 TINY: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 N_TASKS, N_UAVS, N_ENVS = 6, 2, 4

@@ -17,13 +17,13 @@ from sb3_uav.envs.generators import MixtureGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its import CHECKPOINT_FOLDER, WARM_START_FOLDER, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, WARM_START_FOLDER, read_state
 
 pytest.importorskip("numba")
 from sb3_uav.training import imitation
 from sb3_uav.training.imitation import Lesson, good_tours, imitate, search_lessons, varied
 
-WARM_START = {"sb3_uav.training.imitation.imitate": {"n_subsets": 40, "n_updates": 4, "batch_size": 8}}
+WARM_START: dict[str, Any] = {"n_subsets": 40, "n_updates": 4, "batch_size": 8}
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,8 @@ def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[st
     assert "imitation" not in capsys.readouterr().out and again.epoch == 2
 
 
-def test_its_goes_on_with_it(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("room", ["training", "solvers"])
+def test_its_goes_on_with_it(room: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that was interrupted in its warm start goes on in another folder, and ends as if it had not been interrupted."""
     monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
     expected = make_its(save_path=str(tmp_path / "expected"))
@@ -220,7 +221,8 @@ def test_its_goes_on_with_it(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> 
     first = tmp_path / "first" / CHECKPOINT_FOLDER
     assert (first / WARM_START_FOLDER / "updates.pt").is_file()
     model = REINFORCE.load(first / read_state(first)["allocator"], env=make_model().env, device="cpu")
-    again = make_its(save_path=str(tmp_path / "second"))
+    # The dotted path that earlier versions needed means the same, and so does the one of before that.
+    again = make_its(save_path=str(tmp_path / "second"), warm_start={f"sb3_uav.{room}.imitation.imitate": WARM_START})
     model.learn(10**9, callback=again)
     # The last two of four updates were not saved, and done again.
     assert len(calls) == 4 + 2 and again.epoch == 1
@@ -249,7 +251,11 @@ def zero_router(router: Any, allocator: Any, generator: Any, rng: np.random.Gene
 @pytest.mark.parametrize(
     "warm_start, message",
     [
-        ({}, "warm_start must map the dotted path of one function to its arguments"),
+        ({}, "warm_start must hold arguments of sb3_uav.training.imitation.imitate"),
+        ({"a.b": {}, "c.d": {}}, "warm_start must map the dotted path of one function to its arguments"),
+        ({"a.b": {}, "n_updates": 1}, "warm_start must map the dotted path of one function to its arguments"),
+        ({"a.b": 3}, "warm_start: the arguments of a.b must be a mapping, found 3"),
+        ({"n_tours": 3}, "warm_start: these arguments do not fit .*n_tours"),
         ({"sb3_uav.nothing.at_all": {}}, "warm_start is 'sb3_uav.nothing.at_all', which cannot be imported"),
         ({"sb3_uav.training.imitation.WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
         ({"sb3_uav.training.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),

@@ -16,7 +16,7 @@ from instance_helpers import arrays, assert_equal, poked
 
 from sb3_uav.envs import Instances, RoutePlanningEnv, Schedule, UniformGenerator, check_schedule, nearest_feasible, plan_tours
 from sb3_uav.envs.instances import TENSOR_FIELDS
-from sb3_uav.training.fixed_set import fingerprint
+from sb3_uav.training.fixed_set_returns import fingerprint
 
 # Validation
 

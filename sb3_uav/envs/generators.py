@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -182,6 +183,8 @@ class FixedGenerator:
     """
     Rows of given instances, drawn at random with replacement.
 
+    Two of them are equal if their instances are, so that environments that read the same file play the same problem.
+
     :param instances: The instances to draw from
     :raises ValueError: If there are none
     """
@@ -191,6 +194,20 @@ class FixedGenerator:
     def __post_init__(self) -> None:
         if len(self.instances) == 0:
             raise ValueError("There are no instances to draw from; give at least one.")
+
+    # Taken once: it is compared at every update, and the instances are not meant to change.
+    @cached_property
+    def _digest(self) -> str:
+        return self.instances.digest()
+
+    def __eq__(self, other: object) -> bool:
+        # A subclass may draw them differently.
+        if not isinstance(other, FixedGenerator) or type(other) is not type(self):
+            return NotImplemented
+        return self.instances is other.instances or self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
 
     @property
     def n_tasks(self) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
@@ -18,7 +18,40 @@ from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.problem import Problem
 
 # Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
-TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker)
+TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
+
+
+def strip_wrappers(env: gym.Env) -> gym.Env:
+    """
+    :param env: An environment
+    :return: What is left without the wrappers around it that change nothing, among them a time limit that no episode reaches
+    """
+    inner: Any = env
+    # Only exact types: a subclass may behave differently.
+    while type(inner) in TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
+        inner = inner.env
+    return inner
+
+
+def find_monitor(env: gym.Env) -> Monitor | None:
+    """
+    :param env: An environment
+    :return: The outermost ``Monitor`` around it
+    """
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, Monitor):
+            return inner
+        inner = inner.env
+    return None
+
+
+def _can_cut_off(limit: TimeLimit) -> bool:
+    """Whether an episode inside may be longer than the limit; True if there is no telling."""
+    n_steps = None if limit.spec is None else limit.spec.max_episode_steps
+    inner = limit.unwrapped
+    # The router's tours visit every task and the depot at most; the allocator takes one step fewer.
+    return n_steps is None or not isinstance(inner, ProblemEnv) or n_steps < inner.problem.generator.n_tasks + 1
 
 
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
@@ -26,12 +59,10 @@ def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     :param env: An environment
     :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper changes its behavior
     """
-    inner: Any = env
-    # Only exact types and ProblemEnv's own methods: a subclass may behave differently.
-    while type(inner) in TRANSPARENT_WRAPPERS:
-        inner = inner.env
+    inner = strip_wrappers(env)
     if not isinstance(inner, ProblemEnv):
         return None
+    # Only ProblemEnv's own methods: a subclass may behave differently.
     inherits = type(inner).step is ProblemEnv.step and type(inner).reset is ProblemEnv.reset
     return inner if inherits else None
 
@@ -55,7 +86,7 @@ class BatchedVecEnv(VecEnv):
             raise ValueError(f"BatchedVecEnv cannot batch {env}; use stable_baselines3's DummyVecEnv for it.")
         self.template = problem_env
         self.problem: Problem = problem_env.problem
-        self._monitor = env if isinstance(env, Monitor) else None
+        self._monitor = find_monitor(env)
         self._info_keywords: tuple[str, ...] = () if self._monitor is None else self._monitor.info_keywords
         self._windows: dict[int, Any] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
@@ -130,6 +161,11 @@ class BatchedVecEnv(VecEnv):
         if self._monitor is None or self._monitor.results_writer is None:
             return None
         return os.path.dirname(self._monitor.results_writer.file_handler.name)
+
+    @property
+    def info_keywords(self) -> tuple[str, ...]:
+        """What the monitor file holds of an episode besides its return, length and time."""
+        return self._info_keywords
 
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""

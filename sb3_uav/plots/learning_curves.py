@@ -39,7 +39,7 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
     :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
     :raises FileNotFoundError: If there is no such log
-    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers, or the suffix of the
+    :raises ValueError: If the log has no epochs, misses a column or holds something other than numbers, or the suffix of the
         figure is not allowed
     :raises ImportError: If matplotlib is not installed
     """
@@ -57,7 +57,7 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
     :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :return: The epochs of each level, in order; a level may have none
     :raises FileNotFoundError: If there is no such log
-    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers
+    :raises ValueError: If the log has no epochs, misses a column or holds something other than numbers
     """
     its_log = Path(its_log)
     if its_log.is_dir():
@@ -89,7 +89,7 @@ def _draw_level(axes: Any, title: str, epochs: Sequence[LoggedEpoch]) -> None:
     """
     :param axes: matplotlib axes
     :param title: Title of the panel
-    :param epochs: Of one level, in order
+    :param epochs: Epochs of one level, in order
     """
     style_axes(axes, title, "epoch", "tasks completed (mean)")
     if not epochs:

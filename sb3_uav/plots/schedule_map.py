@@ -1,4 +1,4 @@
-"""Schedules drawn on a map, one or several beside each other (paper, Fig. 3)."""
+"""Schedules drawn on a map, one or several side by side (paper, Fig. 3)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class MapPanel(NamedTuple):
     One map of a figure.
 
     :param instances: The instances
-    :param row: Which of them
+    :param row: Index of the instance
     :param schedule: What to draw
     :param title: Title of the panel
     """
@@ -38,11 +38,11 @@ def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str 
     Draw one schedule: the depot, tours colored by UAV, skipped tasks hollow, counts and lengths in the legend.
 
     :param instances: The instances
-    :param row: Which of them
+    :param row: Index of the instance
     :param schedule: The schedule
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
     :param title: Title of the figure
-    :raises ValueError: If the suffix of the file is another one
+    :raises ValueError: If the file has another suffix
     :raises ImportError: If matplotlib is not installed
     """
     plot_schedules([MapPanel(instances, row, schedule, title)], path)
@@ -50,11 +50,11 @@ def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str 
 
 def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> None:
     """
-    Draw several schedules beside each other, :data:`MAX_COLUMNS` in a line.
+    Draw several schedules side by side, :data:`MAX_COLUMNS` in a row.
 
     :param panels: What to draw
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
-    :raises ValueError: If there are no panels, or the suffix of the file is another one
+    :raises ValueError: If there are no panels, or the file has another suffix
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
@@ -64,7 +64,7 @@ def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> 
 def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -> Any:
     """
     :param panels: What to draw
-    :param n_columns: How many of them stand in a line
+    :param n_columns: Number of panels in a row
     :return: A matplotlib figure
     :raises ValueError: If there are no panels
     :raises ImportError: If matplotlib is not installed
@@ -78,7 +78,7 @@ def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):
         draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
-        # What room there is too much belongs to the legend.
+        # Extra vertical space goes to the legend.
         axes.set_anchor("N")
     for axes in grid[len(panels) :]:
         axes.set_axis_off()

@@ -32,7 +32,7 @@ class StaticObservation(NamedTuple):
         """:param observation: A batch of preprocessed observations"""
         return cls(
             depot=observation["depot"],
-            tasks=observation["tasks"].view(len(observation["tasks"]), -1, 2),
+            tasks=observation["tasks"].unflatten(1, (-1, 2)),
             values=observation["task_values"],
             task_mask=observation["task_mask"].bool(),
             max_distance=observation["max_distance"],

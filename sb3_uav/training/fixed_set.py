@@ -2,193 +2,36 @@
 
 from __future__ import annotations
 
-import io
 import os
 import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.common.npz import read_npz
-from sb3_uav.common.random_streams import FIXED_SET_ACTION_STREAM, FIXED_SET_STREAM, random_stream
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training.common import find_run_folder, siblings
+from sb3_uav.training.callback_tree import siblings
+from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, FixedSetResult
+from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem, fingerprint
 from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
+from sb3_uav.training.run_folder import find_run_folder
 
-RESULTS_FILE = "evaluations.npz"
 INSTANCES_FILE = "evaluation_instances.npz"
 BEST_MODEL_FILE = "best_model.zip"
 # Where a stock EvalCallback of the same run writes its results instead; it appends the suffix .npz.
 STOCK_RESULTS = "evaluations_eval_callback"
-# An attribute of the model, so that any zip of it knows what it has been through: SB3 starts counting steps anew.
+# An attribute of the model, so that every zip of it names its earlier evaluations: SB3 starts counting steps again from 0.
 STATE = "fixed_set_evaluations"
 # SB3's EvalCallback is called every 10,000 calls, rl_zoo3's every 25,000 steps.
 DEFAULT_EVAL_FREQ = 25_000
-# How many instances are decoded at once: the smaller of the paper's batches.
-CHUNK_ROWS = 256
-
-
-class FixedSetResult(NamedTuple):
-    """
-    :param greedy: ``(n_instances,)`` float64, returns of the greedy episodes
-    :param lengths: ``(n_instances,)`` int64, their steps
-    :param sampled: ``(n_instances,)`` float64, best returns of the sampled episodes; ``(0,)`` without sampling
-    """
-
-    greedy: np.ndarray
-    lengths: np.ndarray
-    sampled: np.ndarray
-
-
-class EvaluationHistory(NamedTuple):
-    """
-    What ``evaluations.npz`` holds. The first three arrays are those of SB3's ``EvalCallback``, which rl_zoo3's plots read.
-
-    :param timesteps: ``(n_evaluations,)`` int64, environment steps that the policy had learned from
-    :param results: ``(n_evaluations, n_instances)`` float64, returns of the greedy episodes
-    :param ep_lengths: ``(n_evaluations, n_instances)`` int64, their steps
-    :param sampled: ``(n_evaluations, n_instances)`` float64, best returns of the sampled episodes; no columns without sampling
-    :param train_seconds: ``(n_evaluations,)`` float64, wall time of the training so far, evaluations left out
-    :param cpu_seconds: ``(n_evaluations,)`` float64, the same of the process on all cores
-    """
-
-    timesteps: np.ndarray
-    results: np.ndarray
-    ep_lengths: np.ndarray
-    sampled: np.ndarray
-    train_seconds: np.ndarray
-    cpu_seconds: np.ndarray
-
-    @classmethod
-    def empty(cls, n_instances: int, n_samples: int) -> EvaluationHistory:
-        """
-        :param n_instances: Size of the set
-        :param n_samples: Samples per instance
-        :return: No evaluations
-        """
-        return cls(
-            timesteps=np.zeros(0, dtype=np.int64),
-            results=np.zeros((0, n_instances)),
-            ep_lengths=np.zeros((0, n_instances), dtype=np.int64),
-            sampled=np.zeros((0, n_instances if n_samples > 0 else 0)),
-            train_seconds=np.zeros(0),
-            cpu_seconds=np.zeros(0),
-        )
-
-    def append(self, timesteps: int, result: FixedSetResult, seconds: np.ndarray) -> EvaluationHistory:
-        """
-        :param timesteps: Steps learned from
-        :param result: Of the evaluation
-        :param seconds: Wall and CPU seconds of the training
-        :return: This history and one more evaluation
-        """
-        row = (timesteps, result.greedy, result.lengths, result.sampled, *seconds)
-        return EvaluationHistory(
-            *(np.concatenate([old, np.asarray([new], dtype=old.dtype)]) for old, new in zip(self, row, strict=True))
-        )
-
-    def until(self, timesteps: int) -> EvaluationHistory:
-        """
-        :param timesteps: Steps learned from
-        :return: The evaluations up to there
-        """
-        return EvaluationHistory(*(array[self.timesteps <= timesteps] for array in self))
-
-    def save(self, path: Path, n_samples: int) -> None:
-        """
-        :param path: The ``.npz`` to write, under a temporary name that is renamed
-        :param n_samples: Samples per instance, noted in it for readers
-        """
-        file = io.BytesIO()
-        np.savez(file, **self._asdict(), n_samples=n_samples)
-        write_atomically(path, file.getvalue())
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> EvaluationHistory:
-        """
-        :param path: An ``evaluations.npz`` of :class:`FixedSetEvalCallback`
-        :return: The history
-        :raises FileNotFoundError: If there is no such file
-        :raises ValueError: If it is damaged or was written by something else
-        """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; give the {RESULTS_FILE} that FixedSetEvalCallback wrote.")
-        arrays = read_npz(path, "delete it and evaluate anew")
-        missing = set(cls._fields) - set(arrays)
-        if missing:
-            raise ValueError(f"{path}: arrays {sorted(missing)} are missing; it was not written by FixedSetEvalCallback.")
-        return cls(**{name: arrays[name] for name in cls._fields})
-
-
-def draw_fixed_set(problem: Problem, n_instances: int, seed: int) -> Instances:
-    """
-    :param problem: Whose instances to draw
-    :param n_instances: How many
-    :param seed: Which of the sets; the same one whatever the seed of a training, and disjoint from the instances of any
-    :return: The instances, on the CPU
-    """
-    return problem.generator(n_instances, random_stream(seed, FIXED_SET_STREAM))
-
-
-def evaluate_fixed_set(
-    policy: EpisodicPolicy, problem: Problem, instances: Instances, n_samples: int, seed: int = 0
-) -> FixedSetResult:
-    """
-    Play every instance once greedily and ``n_samples`` times by sampling, with the fused driver.
-
-    Global random states and the policy's mode stay as they are; the samples come from the same numbers every time.
-
-    :param policy: The policy
-    :param problem: What it plays; its router, if any, plans the tours
-    :param instances: The set, on the CPU
-    :param n_samples: Samples per instance; 0 for none
-    :param seed: Of the samples
-    :return: What it achieves
-    """
-    was_training = policy.training
-    policy.set_training_mode(False)
-    try:
-        fitting = policy.rows_that_fit(instances.n_tasks + 1, max(n_samples, 1) * instances.n_uavs)
-        parts = []
-        for rows in th.arange(len(instances)).split(min(CHUNK_ROWS, fitting)):
-            first = int(rows[0])
-            parts.append(_evaluate_chunk(policy, problem, instances[rows], n_samples, seed, first))
-    finally:
-        policy.set_training_mode(was_training)
-    return FixedSetResult(*(np.concatenate(field) for field in zip(*parts, strict=True)))
-
-
-@th.no_grad()
-def _evaluate_chunk(
-    policy: EpisodicPolicy, problem: Problem, instances: Instances, n_samples: int, seed: int, first: int
-) -> FixedSetResult:
-    """
-    :param first: Index of the first of these instances in the set
-    """
-    part = policy.arrange(instances).to(policy.device)
-    cache = policy.encode(part)
-    greedy = policy.decode_episodes(part, cache=cache)
-    returns, lengths = problem.returns(part, greedy)[:, 0], problem.lengths(part, greedy)[:, 0]
-    best = returns[:0]
-    if n_samples > 0:
-        state = int(random_stream(seed, FIXED_SET_ACTION_STREAM, first).integers(2**63 - 1))
-        generator = th.Generator(policy.device).manual_seed(state)
-        sampled = policy.decode_episodes(part, n_samples, False, generator, cache)
-        best = problem.returns(part, sampled).amax(1)
-    return FixedSetResult(returns.cpu().numpy(), lengths.cpu().numpy(), best.cpu().numpy())
 
 
 class FixedSetEvalCallback(BaseCallback):
@@ -478,27 +321,3 @@ class FixedSetEvalCallback(BaseCallback):
         # As SB3's EvalCallback does, so that the values stand at their own step.
         self.logger.record("time/total_timesteps", self.model.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.model.num_timesteps)
-
-
-def evaluated_problem(env: VecEnv) -> Problem | None:
-    """
-    :param env: The training environment of an algorithm
-    :return: The problem behind it; None if it is not one of ours, or if its observations are changed
-    """
-    while isinstance(env, VecMonitor) or (isinstance(env, VecNormalize) and not env.norm_obs):
-        env = env.venv
-    if isinstance(env, BatchedVecEnv):
-        return env.problem
-    if isinstance(env, DummyVecEnv):
-        row = unwrap_problem_env(env.envs[0])
-        return None if row is None else row.problem
-    return None
-
-
-def fingerprint(instances: Instances, n_samples: int) -> str:
-    """
-    :param instances: Instances
-    :param n_samples: Samples per instance
-    :return: A name for the evaluation on these
-    """
-    return instances.digest(repr((instances.tasks.shape, instances.n_uavs, n_samples)))[:16]

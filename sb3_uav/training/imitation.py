@@ -11,6 +11,7 @@ import numpy as np
 import torch as th
 from torch.nn import functional
 
+from sb3_uav.common.random_streams import torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, training_batch
 from sb3_uav.envs.instances import Instances
@@ -129,7 +130,7 @@ def search_lessons(
     allocator.set_training_mode(False)
     while n_found < n_subsets:
         instances = allocator.arrange(training_batch(generator, max(batch_size // 2, 1), rng))
-        actions = th.Generator(allocator.device).manual_seed(int(rng.integers(2**63 - 1)))
+        actions = torch_generator(rng, allocator.device)
         assignment = allocator.decode_episodes(instances.to(allocator.device), deterministic=False, generator=actions)
         subsets = split_tasks(instances, assignment.cpu()).instances
         n_rows = 2 * batch_size * TYPICAL_SIZE // subsets.n_tasks

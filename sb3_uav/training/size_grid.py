@@ -16,12 +16,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import GRID_SEED
 from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.allocation import AllocationProblem, plan_tours
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import AllocatorPolicy
-from sb3_uav.reinforce.reinforce import find_problem
-from sb3_uav.training.common import siblings
+from sb3_uav.reinforce.recognition import find_problem
+from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
 
 # UAVs, tasks, instances.
@@ -88,8 +89,8 @@ class SizeGridCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         if not self._is_restored:
             self._restore()
-        if self.model._n_updates % self.freq == 0 and (
-            not self.records or self.records[-1]["updates"] != self.model._n_updates
+        if n_updates(self.model) % self.freq == 0 and (
+            not self.records or self.records[-1]["updates"] != n_updates(self.model)
         ):
             self.evaluate()
 
@@ -106,7 +107,7 @@ class SizeGridCallback(BaseCallback):
         folder, its = self._folder(), self._its()
         if folder is None:
             warnings.warn("SizeGridCallback keeps no best pair: set save_path to a folder.", stacklevel=3)
-        if folder is None or self.model._n_updates == 0:
+        if folder is None or n_updates(self.model) == 0:
             return
         earlier = [folder] if its is None or its.resume_from is None else [folder, its.resume_from.parent]
         for source in earlier:
@@ -114,7 +115,7 @@ class SizeGridCallback(BaseCallback):
                 continue
             with (source / GRID_FILE).open(newline="", encoding="utf-8") as file:
                 rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
-            self.records = [row for row in rows if row["updates"] <= self.model._n_updates]
+            self.records = [row for row in rows if row["updates"] <= n_updates(self.model)]
             self.best_score = max((row["score"] for row in rows), default=-np.inf)
             for name in (BEST_ALLOCATOR_FILE, BEST_ROUTER_FILE):
                 if source != folder and (source / name).is_file():
@@ -135,12 +136,12 @@ class SizeGridCallback(BaseCallback):
         score = float(np.mean([np.log(max(objective, 1e-9)) for objective in objectives.values()]))
         its = self._its()
         seconds = round(time.time() - self._start, 1)
-        self.records.append({"updates": self.model._n_updates, "seconds": seconds, **objectives, "score": score})
+        self.records.append({"updates": n_updates(self.model), "seconds": seconds, **objectives, "score": score})
         for name, objective in objectives.items():
             self.logger.record(f"size_grid/{name}", objective)
         if self.verbose > 0:
             found = ", ".join(f"{name} {objective:.2f}" for name, objective in objectives.items())
-            print(f"update {self.model._n_updates}: {found}, score {score:.4f}", flush=True)
+            print(f"update {n_updates(self.model)}: {found}, score {score:.4f}", flush=True)
         folder = self._folder()
         if folder is not None:
             text = io.StringIO()

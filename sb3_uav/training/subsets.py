@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, training_batch
 from sb3_uav.envs.instances import Instances
@@ -18,9 +19,9 @@ from sb3_uav.policies import AllocatorPolicy
 HELD_OUT_ROWS = 256
 
 
-class WholeInstances:
+class SingleUavGenerator:
     """
-    Instances with all their tasks for one UAV: what the router is pre-trained on.
+    What generators of the router's instances have in common: one UAV, and the size of the fleet's instances.
 
     :param generator: Draws the instances of the fleet
     """
@@ -31,6 +32,14 @@ class WholeInstances:
         self.generator = generator
         self.n_tasks = generator.n_tasks
 
+
+class WholeInstances(SingleUavGenerator):
+    """
+    Instances with all their tasks for one UAV: what the router is pre-trained on.
+
+    :param generator: Draws the instances of the fleet
+    """
+
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         return replace(self.generator(batch_size, rng), n_uavs=1)
 
@@ -39,7 +48,7 @@ class WholeInstances:
         return replace(training_batch(self.generator, batch_size, rng), n_uavs=1)
 
 
-class AllocatedSubsets:
+class AllocatedSubsets(SingleUavGenerator):
     """
     Shuffled single-UAV subsets of the instances of one allocator epoch, allocated by sampling from the current allocator.
 
@@ -58,8 +67,6 @@ class AllocatedSubsets:
     :ivar seconds: How long it has taken so far to draw and allocate instances
     """
 
-    n_uavs = 1
-
     def __init__(
         self,
         allocator: AllocatorPolicy,
@@ -70,9 +77,8 @@ class AllocatedSubsets:
         stream: Callable[[int], np.random.Generator],
         shuffle_batches: int = 8,
     ) -> None:
+        super().__init__(generator)
         self.allocator = allocator
-        self.generator = generator
-        self.n_tasks = generator.n_tasks
         self.draw_batch = draw_batch
         self.batches = batches
         self.fraction = fraction
@@ -125,7 +131,7 @@ class AllocatedSubsets:
 
     def _allocate(self, instances: Instances, rng: np.random.Generator) -> Instances:
         device = self.allocator.device
-        generator = th.Generator(device).manual_seed(int(rng.integers(2**63 - 1)))
+        generator = torch_generator(rng, device)
         self.allocator.set_training_mode(False)
         actions = self.allocator.decode_episodes(instances.to(device), deterministic=False, generator=generator)
         return split_tasks(instances, actions.cpu()).instances

@@ -4,7 +4,7 @@ Search spaces of ``-optimize`` for our environments, in rl_zoo3's form: a sample
 rl_zoo3's own spaces for on-policy algorithms replace the network's arguments, discount rewards, and cut episodes anywhere.
 Ours leave to the YAML entry
 
-- the network (``policy`` and ``policy_kwargs``), because no trial sees what a larger one costs in time;
+- the network (``policy`` and ``policy_kwargs``), because trials do not measure the time that a larger one costs;
 - the discount ``gamma``, which is 1 in ours: a task visited late counts as much as one visited early;
 - the rollout (``n_envs`` and ``n_steps``), which holds whole episodes in ours;
 - the router under ``ITSCallback``; tune it on a ``RoutePlanning`` environment.
@@ -45,12 +45,12 @@ from sb3_uav.zoo.rl_zoo3_compat import set_search_space
 
 Params = dict[str, Any]
 Converter = Callable[[Params], Params]
-# Of the trial (optuna.Trial), the number of actions (for noise), n_envs and what off-policy algorithms need.
+# Takes the trial (optuna.Trial), the number of actions (for noise), n_envs and arguments for off-policy algorithms.
 Sampler = Callable[[Any, int, int, Params], Params]
 
 
 def suggest_common(trial: Any) -> Params:
-    """:param trial: Draws what every algorithm has"""
+    """:param trial: Draws the hyperparameters that all algorithms share"""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True),
         "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 5.0, log=True),
@@ -59,7 +59,7 @@ def suggest_common(trial: Any) -> Params:
 
 
 def suggest_critic(trial: Any) -> Params:
-    """:param trial: Draws what algorithms with a critic have"""
+    """:param trial: Draws the hyperparameters of algorithms with a critic"""
     return {
         "gae_lambda": trial.suggest_categorical("gae_lambda", [0.9, 0.95, 0.98, 0.99, 1.0]),
         "vf_coef": trial.suggest_float("vf_coef", 1e-3, 1.0, log=True),
@@ -77,7 +77,7 @@ def sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: Params)
             "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
         }
     )
-    # As rl_zoo3 does, so that reports show the number itself too.
+    # As in rl_zoo3, so that reports also show the number itself.
     trial.set_user_attr("batch_size", hyperparams["batch_size"])
     return hyperparams
 
@@ -119,7 +119,7 @@ def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_a
 
 def convert_powers(params: Params) -> Params:
     """
-    :param params: What a trial drew
+    :param params: Parameters of a trial
     :return: Hyperparameters: ``x_pow`` is the binary logarithm of ``x``, ``one_minus_x`` is 1 - ``x``
     """
     converted: Params = {}
@@ -135,8 +135,8 @@ def convert_powers(params: Params) -> Params:
 
 def convert_reinforce(params: Params) -> Params:
     """
-    :param params: What a trial of REINFORCE drew
-    :return: Hyperparameters; arguments of the YAML's baseline do not go with another one
+    :param params: Parameters of a REINFORCE trial
+    :return: Hyperparameters; the YAML's baseline arguments are dropped, because they do not fit other baselines
     """
     return {**convert_powers(params), "baseline_kwargs": None}
 
@@ -157,7 +157,7 @@ OTHER_SPACES: dict[str, tuple[Sampler, Converter]] = {
 
 def register_search_spaces(env_id: str) -> None:
     """
-    Let rl_zoo3 use the search spaces for this environment, from now on.
+    Register the search spaces for this environment with rl_zoo3.
 
     :param env_id: Id of a registered environment
     """
@@ -177,7 +177,7 @@ def is_ours(env_id: str) -> bool:
 
 class StopWhenDiverged(BaseCallback):
     """
-    Stops a training whose parameters are no longer finite, which the fused driver would not notice by itself.
+    Stops a training whose parameters are no longer finite, which the fused driver does not detect.
 
     :raises ValueError: At the start of a rollout; ``-optimize`` prunes a trial on it
     """

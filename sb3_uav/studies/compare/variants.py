@@ -1,4 +1,4 @@
-"""What :mod:`sb3_uav.studies.compare.study` compares: entries of our YAMLs, with changes."""
+"""The variants of a comparison: entries of our YAMLs with changes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from sb3_uav.zoo.configs import default_config, plain_numbers
+from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
 SHARED_SAMPLES = 8
@@ -18,9 +16,9 @@ ROLLOUT_TEST_INSTANCES = 1_000
 
 class Variant(NamedTuple):
     """
-    One of the things that are compared.
+    One of the compared trainings.
 
-    :param name: How tables and figures call it
+    :param name: Name in tables and figures
     :param algo: rl_zoo3's name of the algorithm
     :param entry: The complete YAML entry of the environment, callbacks included
     """
@@ -46,11 +44,8 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     path = default_config(algo) if conf_file is None else Path(conf_file)
     if path is None or not path.is_file():
         raise ValueError(f"algo {algo!r}: there is no YAML {path or f'zoo_configs/{algo}.yml'}; name one as conf_file.")
-    try:
-        entries = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
+    entries = read_yaml(path)
+    if not isinstance(entries.get(env_id), dict):
         raise ValueError(f"{path}: has no entry for {env_id}; add one, or compare on another environment.")
     return plain_numbers(entries[env_id])
 
@@ -85,20 +80,11 @@ def read_variants(path: Path | None, env_id: str) -> list[Variant]:
     """
     :param path: A YAML of variants; the default ones when None
     :param env_id: Id of the environment
-    :return: The variants with the entries of their YAMLs, as they stand there but for what the variants replace
+    :return: The variants with their complete YAML entries
     :raises ValueError: If something is missing or not allowed; the message names it
     """
-    if path is None:
-        given = default_variants(env_id)
-    else:
-        if not path.is_file():
-            raise FileNotFoundError(f"--variants {path}: no such file.")
-        try:
-            given = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ValueError(f"--variants {path}: cannot be read: {error}") from error
-    changes_of = list(given.values()) if isinstance(given, dict) else []
-    if not changes_of or not all(isinstance(changes, dict) and "algo" in changes for changes in changes_of):
+    given = default_variants(env_id) if path is None else read_yaml(path)
+    if not given or not all(isinstance(changes, dict) and isinstance(changes.get("algo"), str) for changes in given.values()):
         raise ValueError(f"--variants {path}: must be a mapping from names to mappings with at least the key 'algo'.")
     variants = []
     for name, changes in given.items():
@@ -132,7 +118,7 @@ def callbacks_of(entry: dict[str, Any]) -> list[Any]:
 def router_settings(env_id: str) -> dict[str, Any]:
     """
     :param env_id: Id of an allocation environment
-    :return: How our YAML for REINFORCE trains the router beside its allocator; nothing if it does not
+    :return: Settings of the router in our REINFORCE entry; empty if the entry trains no router
     """
     for callback in callbacks_of(read_entry("reinforce", env_id)):
         if callback_name(callback) == "ITSCallback" and isinstance(callback, dict):

@@ -1,74 +1,78 @@
-"""What every file says of its origin."""
+"""The origin that every file states."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 from sb3_uav.evaluation.provenance import describe_machine
-from sb3_uav.plots.figure_files import save_figure
 from sb3_uav.studies.reproduce.paper import paper_tables
 from sb3_uav.studies.reproduce.scales import Scale
 
-FIGURE_SUFFIXES = (".png", ".pdf")
+KEYS = ("Command", "Scale", "Seed", "Versions", "Machine", "Figures of the paper")
 
 
 @dataclass(frozen=True)
 class Origin:
     """
-    :param command: The command line
-    :param scale: The scale
-    :param seed: The seed
+    :param lines: A line for each of :data:`KEYS`
     """
 
-    command: str
-    scale: Scale
-    seed: int
+    lines: tuple[str, ...]
 
-    def lines(self) -> list[str]:
-        """:return: Command, scale, seed, versions and machine, one line each"""
-        machine = describe_machine()
-        versions = ", ".join(f"{package} {version}" for package, version in machine["versions"].items())
-        return [
-            f"Command: {self.command}",
-            f"Scale: {self.scale.name}, {self.scale.text}",
-            f"Seed: {self.seed}",
-            f"Versions: {versions}",
-            f"Machine: {machine['platform']}, {machine['cpu_count']} CPUs",
-            f"Figures of the paper: {paper_tables()['source']}",
-        ]
+    @classmethod
+    def of(cls, command: str, scale: Scale, seed: int) -> Origin:
+        """
+        :param command: The command line
+        :param scale: The scale
+        :param seed: The seed
+        :return: These, with the versions and the machine of this process
+        """
+        versions = ", ".join(f"{package} {version}" for package, version in describe_machine()["versions"].items())
+        texts = (
+            command,
+            f"{scale.name}, {scale.text}",
+            str(seed),
+            versions,
+            # Only what is needed to interpret times: neither the kernel version nor the name of the machine.
+            f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
+            paper_tables()["source"],
+        )
+        return cls(tuple(f"{key}: {text}" for key, text in zip(KEYS, texts, strict=True)))
 
-    def metadata(self) -> dict[str, str]:
-        """:return: The same for pictures"""
-        return {"Title": self.command, "Subject": " | ".join(self.lines())}
+    @classmethod
+    def read(cls, comments: Sequence[str]) -> tuple[Origin, list[str]]:
+        """
+        :param comments: Comments of a table, in the order in which they were written
+        :return: The origin among them, and the others
+        :raises ValueError: If they do not begin with the origin
+        """
+        lines, others = comments[: len(KEYS)], comments[len(KEYS) :]
+        if [line.partition(": ")[0] for line in lines] != list(KEYS):
+            raise ValueError(f"its comments do not begin with {', '.join(KEYS)}")
+        return cls(tuple(lines)), list(others)
+
+    def __getitem__(self, key: str) -> str:
+        """
+        :param key: One of :data:`KEYS`
+        :return: What its line says
+        """
+        return self.lines[KEYS.index(key)].partition(": ")[2]
+
+    def metadata(self, suffix: str) -> dict[str, str | None]:
+        """
+        :param suffix: Of a picture
+        :return: The same under the keys that its format has, without the time, so that equal data give equal files
+        """
+        title, text = self["Command"], " | ".join(self.lines)
+        return (
+            {"Title": title, "Subject": text, "CreationDate": None}
+            if suffix == ".pdf"
+            else {"Title": title, "Description": text}
+        )
 
     def footer(self) -> str:
-        """:return: What a picture says of itself"""
-        return f"sb3-uav reproduce, scale {self.scale.name}, seed {self.seed}"
-
-
-def write_figure(figure: Any, origin: Origin, stem: Path) -> list[Path]:
-    """
-    :param figure: A matplotlib figure
-    :param origin: Where it comes from
-    :param stem: Path of the files without their suffix
-    :return: The files
-    """
-    figure.supxlabel(origin.footer(), fontsize=7, color="0.45", x=0.995, ha="right")
-    paths = []
-    for suffix in FIGURE_SUFFIXES:
-        path = stem.with_name(stem.name + suffix)
-        save_figure(figure, path, metadata_of(suffix, origin.metadata()))
-        paths.append(path)
-    return paths
-
-
-def metadata_of(suffix: str, metadata: Mapping[str, str]) -> dict[str, str]:
-    """
-    :param suffix: Of a picture
-    :param metadata: Title and subject
-    :return: The same under the keys that its format has
-    """
-    return dict(metadata) if suffix == ".pdf" else {"Title": metadata["Title"], "Description": metadata["Subject"]}
+        """:return: The line at the bottom of a picture"""
+        return f"sb3-uav reproduce, scale {self['Scale'].partition(',')[0]}, seed {self['Seed']}"

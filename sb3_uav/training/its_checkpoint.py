@@ -1,0 +1,116 @@
+"""The checkpoint of both levels: two zips, and a state file that names them and is replaced last."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_uav.common.files import write_atomically
+from sb3_uav.common.saving import save_atomically
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.epoch_log import EpochRecord
+
+CHECKPOINT_FOLDER = "its_checkpoint"
+STATE_FILE = "its_state.json"
+WARM_START_FOLDER = "warm_start"
+# An attribute of the allocator, so that every zip of it names its last checkpoint: stock rl_zoo3 does not tell callbacks
+# which zip a run continues.
+CHECKPOINT = "its_checkpoint"
+
+
+def write_checkpoint(
+    folder: Path,
+    allocator: BaseAlgorithm,
+    router: BaseAlgorithm,
+    epoch: int,
+    records: Sequence[EpochRecord],
+    warm_started: bool,
+) -> None:
+    """
+    Write both zips and the state of the strategy.
+
+    The state names the zips it belongs to and is replaced last, so the folder is consistent at any moment.
+
+    :param folder: Where to write them
+    :param allocator: The allocator's algorithm
+    :param router: The router's
+    :param epoch: Finished epochs of the allocator
+    :param records: The epochs of both levels so far
+    :param warm_started: Whether the router's warm start, if there is one, is over
+    :raises OSError: If a file cannot be written
+    """
+    setattr(allocator, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": epoch})
+    # Another name before the warm start, because a zip that the state file names must not change.
+    number = str(n_router_epochs(records)) if warm_started else "start"
+    names = {"allocator": f"allocator_{epoch}.zip", "router": f"router_{number}.zip"}
+    save_atomically(allocator, folder / names["allocator"])
+    save_atomically(router, folder / names["router"])
+    state = {"epoch": epoch, **names, "warm_started": warm_started, "records": [asdict(record) for record in records]}
+    write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
+    for old in folder.iterdir():
+        if re.fullmatch(r"(allocator|router)_(\d+|start)\.zip", old.name) and old.name not in names.values():
+            old.unlink()
+
+
+def n_router_epochs(records: Sequence[EpochRecord]) -> int:
+    """
+    :param records: Epochs of both levels
+    :return: How many of them are the router's
+    """
+    return sum(record.level == "router" for record in records)
+
+
+def noted_checkpoint(allocator: BaseAlgorithm) -> Path | None:
+    """
+    :param allocator: An allocator that was loaded from a zip
+    :return: The checkpoint that it belongs to, if it is still where it was written
+    """
+    noted = getattr(allocator, CHECKPOINT, None)
+    if noted is None or not (Path(noted["folder"]) / STATE_FILE).is_file():
+        return None
+    return Path(noted["folder"])
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """
+    :param folder: A checkpoint of :class:`~sb3_uav.training.ITSCallback`
+    :return: The contents of its state file: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``, and,
+        unless an older version wrote it, ``warm_started``
+    :raises FileNotFoundError: If there is none
+    :raises ValueError: If it is damaged
+    """
+    path = Path(folder) / STATE_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
+    try:
+        state = json.loads(path.read_text())
+        missing = {"epoch", "allocator", "router", "records"} - set(state)
+        for record in state.get("records", []):
+            EpochRecord(**record)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not an intact state file ({error}); resume from another checkpoint.") from error
+    if missing:
+        raise ValueError(f"{path}: fields {sorted(missing)} are missing; resume from another checkpoint.")
+    return state
+
+
+def check_allocator(folder: Path, state: dict[str, Any], allocator: BaseAlgorithm) -> None:
+    """
+    :param folder: A checkpoint
+    :param state: Its state
+    :param allocator: What is going to learn
+    :raises ValueError: If it is not the allocator of this checkpoint
+    """
+    noted = getattr(allocator, CHECKPOINT, {"epoch": state["epoch"]})["epoch"]
+    epoch = allocator.epoch if isinstance(allocator, REINFORCE) else noted
+    if epoch != state["epoch"]:
+        raise ValueError(
+            f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {epoch}; "
+            f"train the allocator of {folder / state['allocator']}."
+        )

@@ -1,0 +1,156 @@
+"""The router's algorithm and environment, beside the allocator's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.sb3_compat import forget_last_observation, set_last_observation
+from sb3_uav.envs.generators import InstanceGenerator
+from sb3_uav.envs.routing import RoutePlanningEnv
+from sb3_uav.envs.vec_env import BatchedVecEnv
+from sb3_uav.policies import RouterPolicy
+from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.algorithms import resolve_algorithm
+from sb3_uav.training.episode_buffer import use_episode_buffer
+from sb3_uav.training.epoch_log import EpisodeStatistics
+from sb3_uav.training.freezing import Freezer
+from sb3_uav.training.random_state import undisturbed_random_state
+from sb3_uav.training.subsets import WholeInstances
+
+# Settings of the router that follow from the environment, or that its zip decides when a run is resumed.
+NOT_RELOADED = {"algo", "n_envs", "policy", "policy_kwargs"}
+
+
+class RouterTrainer:
+    """
+    Trains the router epoch by epoch.
+
+    :param settings: ``algo``, ``n_envs``, and the algorithm's own arguments, among them ``policy``
+    :param allocator: The allocator's algorithm, which gives seed, device and logger
+    :param n_envs: Number of environments where the settings have none
+    :param generator: Draws the instances of the fleet
+    :param epoch_size: Instances of a router epoch
+    :raises ValueError: If a setting is not allowed; the message names it
+    """
+
+    def __init__(
+        self,
+        settings: dict[str, Any],
+        allocator: BaseAlgorithm,
+        n_envs: int,
+        generator: InstanceGenerator,
+        epoch_size: int,
+    ) -> None:
+        self.settings = settings
+        self.epoch_size = epoch_size
+        kwargs = dict(settings)
+        algo, n_envs = kwargs.pop("algo", "reinforce"), kwargs.pop("n_envs", n_envs)
+        algorithm = resolve_algorithm(algo)
+        if kwargs["policy"] in ("RouterPolicy", f"{RouterPolicy.__module__}.RouterPolicy", "sb3_uav.policies.RouterPolicy"):
+            kwargs["policy"] = RouterPolicy
+        if not isinstance(n_envs, int) or n_envs < 1:
+            raise ValueError(f"router: n_envs is {n_envs!r}; it must be a whole number of at least 1.")
+        if isinstance(kwargs.get("learning_rate"), str):
+            raise ValueError(
+                f"router: learning_rate is {kwargs['learning_rate']!r}; write a number. How many steps the router will "
+                "take is not known, so it has no schedule but lr_decay."
+            )
+        whole = WholeInstances(generator)
+        self.env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=whole)] * n_envs)
+        if algorithm is REINFORCE:
+            kwargs.setdefault("instances_per_epoch", epoch_size)
+        # The next seed, because with the same one both levels would draw the same points.
+        seed = None if allocator.seed is None else allocator.seed + 1
+        try:
+            with undisturbed_random_state():
+                self.algorithm: OnPolicyAlgorithm = algorithm(env=self.env, seed=seed, device=allocator.device, **kwargs)
+        except TypeError as error:
+            raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
+        if not isinstance(self.policy, RouterPolicy):
+            raise ValueError(f"router: policy must be a RouterPolicy, found {type(self.policy).__name__}.")
+        self._prepare()
+        outputs = [f for f in allocator.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
+        folder = str(Path(allocator.logger.dir) / "router") if outputs and allocator.logger.dir else None
+        self.algorithm.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
+
+    @property
+    def policy(self) -> BasePolicy:
+        """The router's policy; SB3 declares it an ``ActorCriticPolicy``, which a maskable one is not."""
+        return self.algorithm.policy
+
+    @property
+    def plan(self) -> Any:
+        """What plans tours in the allocator's environments."""
+        assert isinstance(self.policy, RouterPolicy)
+        return self.policy.plan
+
+    def _prepare(self) -> None:
+        """Give the router the buffer of whole episodes, and reset its environment."""
+        is_stock_buffer = type(self.algorithm.rollout_buffer) in (DictRolloutBuffer, MaskableDictRolloutBuffer)
+        if is_stock_buffer and not isinstance(self.algorithm, REINFORCE):
+            # A YAML file cannot name a buffer class.
+            use_episode_buffer(self.algorithm)
+        # SB3 would reset it when the router first learns, which may be in the middle of generated subsets.
+        observation: Any = self.env.reset()
+        set_last_observation(self.algorithm, observation)
+        self.freezer = Freezer(self.policy)
+
+    def learn(self, number: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
+        """
+        Let the router learn for one epoch.
+
+        :param number: Number of the epoch, from 1
+        :param statistics: Counts its episodes
+        :param others: More callbacks
+        :return: How many instances it learned from
+        """
+        callback = CallbackList([statistics, *others])
+        if isinstance(self.algorithm, REINFORCE):
+            before = self.algorithm.n_instances
+            # Up to a multiple of the epoch's size, so that whole batches do not add up to more epochs than there are.
+            self.algorithm.learn_instances(number * self.epoch_size - before, callback)
+            return self.algorithm.n_instances - before
+        # SB3 keeps the last observation of the previous generator's instances otherwise.
+        forget_last_observation(self.algorithm)
+        # Whole rollouts, because SB3 throws away one that a callback stops.
+        steps = self.algorithm.n_steps * self.algorithm.n_envs
+        while statistics.n_episodes < self.epoch_size:
+            self.algorithm.learn(steps, callback, reset_num_timesteps=False)
+        return statistics.n_episodes
+
+    def save(self, path: Path) -> None:
+        """
+        :param path: The zip to write
+        :raises OSError: If it cannot be written; an older file of this name is then untouched
+        """
+        save_atomically(self.algorithm, path)
+
+    def load(self, path: Path) -> None:
+        """
+        Continue with a router of an earlier run: the networks are those of the zip, the settings those of now, as rl_zoo3
+        does with the allocator.
+
+        :param path: Its zip
+        :raises ValueError: If it is not an intact router
+        """
+        given = self.settings.keys() - NOT_RELOADED
+        # From the new router, as its constructor may have changed them.
+        settings = {key: getattr(self.algorithm, key) for key in given if hasattr(self.algorithm, key)}
+        try:
+            with undisturbed_random_state():
+                loaded = type(self.algorithm).load(path, env=self.env, device=self.algorithm.device, **settings)
+        except (ValueError, RuntimeError, OSError) as error:
+            raise ValueError(f"{path}: not an intact router ({error}); use another checkpoint.") from error
+        loaded.set_logger(self.algorithm.logger)
+        self.algorithm = loaded
+        self._prepare()

@@ -1,0 +1,76 @@
+"""What the router learns before anything else: imitation, or a function of the user's own."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sb3_uav.training.algorithms import import_object
+
+# Where the function stood in earlier versions, as YAML files and their users know it.
+_IMITATION_PATHS = ("sb3_uav.training.imitation.imitate", "sb3_uav.solvers.imitation.imitate")
+
+
+class WarmStart:
+    """
+    A function of the policies of router and allocator, the generator of the instances and a random generator.
+
+    :param given: Arguments of :func:`~sb3_uav.training.imitation.imitate`, or ``{dotted path: arguments}`` of another function
+    :raises ValueError: If it is neither
+    """
+
+    def __init__(self, given: dict[str, Any]) -> None:
+        if not isinstance(given, dict) or not given:
+            raise ValueError(
+                "warm_start must hold arguments of sb3_uav.training.imitation.imitate, such as n_updates, or map the dotted "
+                f"path of one function to its arguments, found {given!r:.80}."
+            )
+        paths = [key for key in given if "." in str(key)]
+        if len(paths) > 1 or (paths and len(given) > 1):
+            raise ValueError(f"warm_start must map the dotted path of one function to its arguments, found {given!r:.80}.")
+        self.path: str = paths[0] if paths else _IMITATION_PATHS[0]
+        arguments = given[self.path] if paths else given
+        if self.path in _IMITATION_PATHS:
+            self.path = _IMITATION_PATHS[0]
+        if arguments is not None and not isinstance(arguments, dict):
+            raise ValueError(f"warm_start: the arguments of {self.path} must be a mapping, found {arguments!r:.80}.")
+        self.arguments: dict[str, Any] = dict(arguments or {})
+
+    def bind(self, positional: tuple[Any, ...], offered: dict[str, Any]) -> Callable[[], None]:
+        """
+        :param positional: The function's first arguments
+        :param offered: Arguments that it gets if it has parameters of these names
+        :return: The call
+        :raises ValueError: If there is no such function, or the arguments do not fit
+        """
+        try:
+            function = import_object(self.path)
+        except ValueError as error:
+            raise ValueError(
+                f"warm_start is {self.path!r}, which cannot be imported ({error}); give its dotted path."
+            ) from error
+        try:
+            signature = inspect.signature(function)
+            known = {name: value for name, value in offered.items() if name in signature.parameters}
+            call = signature.bind(*positional, **{**known, **self.arguments})
+        except TypeError as error:
+            raise ValueError(f"warm_start: these arguments do not fit {self.path}: {error}") from error
+        return lambda: function(*call.args, **call.kwargs)
+
+
+def bring_progress(folder: Path, earlier: Path | None) -> None:
+    """
+    Leave no progress in the folder but that of the checkpoint that this run continues.
+
+    :param folder: Where the warm start is going to look for it
+    :param earlier: Where the checkpoint has it; None if there is no checkpoint
+    """
+    if earlier is not None and earlier.resolve() == folder.resolve():
+        return
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    if earlier is not None and earlier.is_dir():
+        shutil.copytree(earlier, folder)
