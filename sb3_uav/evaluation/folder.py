@@ -155,14 +155,16 @@ class EvaluationFolder:
         # Instances are numbered through all sets, so that one list must be the beginning of the other.
         for before, now in zip(sources, settings["instances"], strict=False):
             if before != now:
-                described = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
+                pair = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
                 raise ValueError(
-                    f"{self.folder}: holds results of other instances: {described[0]}, not {described[1]}; give the same files "
-                    f"in the same order, {remedy}."
+                    f"{self.folder}: holds results of other instances: {pair[0]}, not {pair[1]}; give the same "
+                    f"files in the same order, {remedy}."
                 )
         for name, solver in settings["solvers"].items():
             was, is_now = solvers.get(name), solver["settings"]
-            for key in sorted({*was, *is_now}) if was is not None and is_now is not None else ():
+            if was is None or is_now is None:
+                continue
+            for key in sorted({*was, *is_now}):
                 if was.get(key) != is_now.get(key):
                     raise ValueError(
                         f"{self.folder}: holds results of another {name!r}, whose {key} was {_abridged(was.get(key))} and not "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_uav.envs.instances import Instances
@@ -17,6 +18,7 @@ from sb3_uav.solvers.base import Solver, SolverResult
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(eq=False)
 class SetEvaluation:
     """
     Evaluates solvers on one set of instances.
@@ -30,25 +32,17 @@ class SetEvaluation:
     :param progress: Called before each solver starts and after each of its instances
     """
 
-    def __init__(
-        self,
-        source: str,
-        instances: Instances,
-        first_index: int,
-        seed: int,
-        folder: EvaluationFolder,
-        runner: Runner,
-        progress: Progress | None,
-    ) -> None:
-        self.source = source
-        self.instances = instances
-        self.first_index = first_index
-        self.seed = seed
-        self.folder = folder
-        self.runner = runner
-        self.progress = progress
-        self._n_tasks = instances.task_mask.sum(1).tolist()
-        self._found: dict[tuple[str, float | None], list[ResultRow]] = {}
+    source: str
+    instances: Instances
+    first_index: int
+    seed: int
+    folder: EvaluationFolder
+    runner: Runner
+    progress: Progress | None
+    _found: dict[tuple[str, float | None], list[ResultRow]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self._n_tasks = self.instances.task_mask.sum(1).tolist()
 
     def rows(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
         """
