@@ -142,7 +142,11 @@ class EvaluationFolder:
             if earlier["format"] != FORMAT:
                 raise ValueError(f"its format is {earlier['format']!r}, expected {FORMAT}")
             sources = [{key: source[key] for key in ("name", "n_instances", "sha256")} for source in earlier["instances"]]
-            solvers = {name: dict(solver["settings"]) for name, solver in earlier["solvers"].items()}
+            # None for solvers that could not be made.
+            solvers = {
+                name: None if solver["settings"] is None else dict(solver["settings"])
+                for name, solver in earlier["solvers"].items()
+            }
             versions = dict(earlier["runs"][-1]["versions"])
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -157,13 +161,19 @@ class EvaluationFolder:
                     f"files in the same order, {anew}."
                 )
         for name, solver in settings["solvers"].items():
-            was, is_now = solvers.get(name, solver["settings"]), solver["settings"]
-            for key in sorted({*was, *is_now}):
+            was, is_now = solvers.get(name), solver["settings"]
+            for key in sorted({*was, *is_now}) if was is not None and is_now is not None else ():
                 if was.get(key) != is_now.get(key):
                     raise ValueError(
                         f"{self.folder}: holds results of another {name!r}, whose {key} was {_abridged(was.get(key))} and not "
                         f"{_abridged(is_now.get(key))}; give it another name, {anew}."
                     )
+        # A solver that cannot be made today is described by what it was when it could.
+        described = {
+            name: solver
+            for name, solver in settings["solvers"].items()
+            if solver["settings"] is not None or name not in earlier["solvers"]
+        }
         installed = settings["runs"][0]["versions"]
         self.changed_versions = [
             f"{package} {versions.get(package, 'none')} -> {installed.get(package, 'none')}"
@@ -173,7 +183,7 @@ class EvaluationFolder:
         return {
             "format": FORMAT,
             "instances": max(sources, settings["instances"], key=len),
-            "solvers": {**earlier["solvers"], **settings["solvers"]},
+            "solvers": {**earlier["solvers"], **described},
             "runs": [*earlier["runs"], *settings["runs"]],
         }
 

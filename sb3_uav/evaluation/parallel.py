@@ -19,7 +19,7 @@ import torch as th
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.results import one_line
-from sb3_uav.solvers.base import OneByOneSolver, Solver, SolverResult
+from sb3_uav.solvers.base import NoScheduleError, OneByOneSolver, Solver, SolverResult
 
 # One that it solves, and one to go on with while the main process writes down the result.
 TASKS_PER_PROCESS = 2
@@ -28,9 +28,11 @@ TASKS_PER_PROCESS = 2
 class Failure(NamedTuple):
     """
     :param message: What went wrong, in one line
+    :param bound: A proven upper bound of the objective, where the solver knows one
     """
 
     message: str
+    bound: float | None = None
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
@@ -39,7 +41,9 @@ class Failure(NamedTuple):
         """
         text = one_line(error)
         # Ours are whole sentences; of others the type is often the best part.
-        return cls(text if text and isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {text}")
+        is_ours = isinstance(error, ValueError | ImportError | NoScheduleError)
+        bound = error.bound if isinstance(error, NoScheduleError) else None
+        return cls(text if text and is_ours else f"{type(error).__name__}: {text}", bound)
 
 
 class Task(NamedTuple):
@@ -147,6 +151,11 @@ class Runner:
         self.n_jobs = n_jobs
         self._pool: ProcessPoolExecutor | None = None
         self._context = _RecordingContext()
+
+    @property
+    def processes(self) -> list[SpawnProcess]:
+        """The processes of the pool that is in use."""
+        return [] if self._pool is None else self._context.processes
 
     def __enter__(self) -> Runner:
         return self

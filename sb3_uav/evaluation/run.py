@@ -128,6 +128,8 @@ def _check_arguments(
     if seed < 0:
         raise ValueError(f"The seed is {seed}; it must be at least 0.")
     for source, batch in sources.items():
+        if len(batch) == 0:
+            raise ValueError(f"The set {source!r} holds no instances; leave it out.")
         try:
             batch.validate()
         except ValueError as error:

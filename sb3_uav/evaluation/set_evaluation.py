@@ -111,7 +111,7 @@ class SetEvaluation:
                 # JSON has no NaN.
                 line["objective"] = None
         solved = None if isinstance(result, Failure) else result
-        bound = None if solved is None or solved.bound is None or not math.isfinite(solved.bound) else float(solved.bound)
+        bound = None if result.bound is None or not math.isfinite(result.bound) else float(result.bound)
         self.folder.add(
             ResultRow(
                 solver=solver.name,

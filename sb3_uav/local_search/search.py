@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from sb3_uav.common.random_streams import WARM_UP_SEED, keyed_generator, mixed_state
 from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
@@ -69,13 +70,15 @@ class LocalSearch:
         :param seed: Of the random numbers
         :return: What kernels work on
         """
-        n_uavs, n_tasks = self.instance.n_uavs, len(self._tasks)
+        n_tasks = len(self._tasks)
+        # More UAVs than tasks are of no use, and each costs memory.
+        n_uavs = max(min(self.instance.n_uavs, self.instance.n_tasks), len(schedule.routes))
         nodes = self._nodes.copy()
         nodes["owner"] = -1
         state = np.zeros(1, kernels.STATE)
         state["limit"] = self._limit
         # The generator must not start from 0.
-        state["random"] = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
+        state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
         tours = np.zeros(n_uavs, kernels.TOUR)
         for uav, route in enumerate(schedule.routes):
@@ -169,7 +172,7 @@ def warm_up() -> None:
     """
     Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
     """
-    instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
+    instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
     search.repair(search.improve(Schedule([])))
 

@@ -19,7 +19,7 @@ def names() -> list[str]:
 
 def files(name: str = DEFAULT_PAIR) -> tuple[Path, Path]:
     """
-    :param name: Of a pair
+    :param name: Name of a pair
     :return: The zips of its allocator and of its router
     :raises ValueError: If there is no such pair
     """

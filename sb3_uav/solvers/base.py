@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
+from sb3_uav.solvers.counting_tasks import CountingTasks
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,23 @@ class SolverResult:
     bound: float | None = None
 
 
+class NoScheduleError(RuntimeError):
+    """
+    A solver that ended without any schedule.
+
+    :param message: Why
+    :param bound: A proven upper bound of the objective, where the solver knows one
+    """
+
+    def __init__(self, message: str, bound: float | None = None) -> None:
+        super().__init__(message)
+        self.bound = bound
+
+    def __reduce__(self) -> tuple[type[NoScheduleError], tuple[str, float | None]]:
+        # Exceptions travel between processes, and would lose what is not an argument of theirs.
+        return type(self), (str(self), self.bound)
+
+
 class Solver(ABC):
     """
     Turns instances into schedules.
@@ -48,10 +67,10 @@ class Solver(ABC):
     spec: str | None = None
     files: Mapping[str, Path] = {}
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any] | None:
         """
         :return: What decides its results beside instances, time limit and seed, as plain data; results of earlier evaluations
-            are used again only if it is the same
+            are used again only if it is the same. None for a solver that has no results
         """
         return {} if self.spec is None else {"spec": self.spec}
 
@@ -78,6 +97,7 @@ class Solver(ABC):
         :param seed: Of all the randomness; without a time limit the same seed gives the same schedules
         :return: One result per instance
         :raises ValueError: If the solver cannot treat these instances, see :meth:`check`
+        :raises NoScheduleError: If it found no schedule for one of them
         """
 
     def solve_rows(
@@ -115,10 +135,12 @@ class OneByOneSolver(Solver):
     @abstractmethod
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         """
-        :param instance: A batch of one, without padding
+        :param instance: A batch of one, without padding, without the tasks that cannot count, and with at most as many UAVs
+            as there are tasks
         :param time_limit: Seconds, or None for the solver's own default
         :param rng: The source of randomness
         :return: The schedule, and a bound where one is known
+        :raises NoScheduleError: If there is none
         """
 
     def solve_row(self, instance: Instances, row: int, time_limit: float | None = None, seed: int = 0) -> SolverResult:
@@ -131,10 +153,13 @@ class OneByOneSolver(Solver):
         """
         self.prepare()
         start = time.perf_counter()
+        counting = CountingTasks.of(instance)
         # A row that is all padding keeps one slot, because no instance has none.
-        trimmed = instance.trim(max(int(instance.task_mask.sum()), 1))
-        solution = self.solve_one(trimmed, time_limit, np.random.default_rng([seed, row]))
-        return SolverResult(solution.schedule, time.perf_counter() - start, bound=solution.bound)
+        n_tasks = max(int(counting.instances.task_mask.sum()), 1)
+        reduced = replace(counting.instances.trim(n_tasks), n_uavs=counting.n_useful_uavs()[0])
+        solution = self.solve_one(reduced, time_limit, keyed_generator(seed, row))
+        schedule = counting.schedule(0, solution.schedule)
+        return SolverResult(schedule, time.perf_counter() - start, bound=solution.bound)
 
     def solve_rows(
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0

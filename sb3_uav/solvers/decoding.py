@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import mixed_state
 from sb3_uav.envs.allocation import plan_tours
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
@@ -191,8 +192,7 @@ def random_generator(instances: Instances, *seed: int) -> th.Generator:
     :param instances: On the device where random numbers are needed
     :param seed: What the random numbers depend on
     """
-    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
-    return th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+    return th.Generator(instances.device).manual_seed(int(mixed_state(*seed) >> np.uint64(1)))
 
 
 def tours_of_tasks(tours: th.Tensor, order: th.Tensor) -> th.Tensor:

@@ -61,6 +61,7 @@ class DLDRL(BatchedSolver):
         super().__init__(batch_size)
         self.allocator = allocator
         self.router = router
+        self.serves_any_fleet = allocator.n_uavs is None
         self.decode = decode
         self.samples = samples
         self.refinement = Refinement(repair, polish)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.allocation import UNASSIGNED, plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
@@ -46,11 +46,11 @@ class KMeansAM(BatchedSolver):
     def solve_batch(
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
-        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED)
+        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
         for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
             if n_tasks > 0:
                 points = instances.tasks[i, :n_tasks].numpy()
-                clusters = kmeans(points, instances.n_uavs, np.random.default_rng([seed, row]), self.restarts)
+                clusters = kmeans(points, instances.n_uavs, keyed_generator(seed, row), self.restarts)
                 assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
         return schedules(plan_tours(instances, assignment, self.router.plan).tours[:, 0])
 

@@ -6,6 +6,7 @@ import hashlib
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import torch as th
 
@@ -13,6 +14,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.solvers.base import Solver, SolverResult
+from sb3_uav.solvers.counting_tasks import CountingTasks
 
 
 class BatchedSolver(Solver):
@@ -21,9 +23,11 @@ class BatchedSolver(Solver):
 
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :raises ValueError: If it is less than 1
+    :ivar serves_any_fleet: Whether it can solve an instance with fewer UAVs than :meth:`check` admitted
     """
 
     uses_time_limit = False
+    serves_any_fleet = True
 
     def __init__(self, batch_size: int | None = None) -> None:
         if batch_size is not None and batch_size < 1:
@@ -42,7 +46,7 @@ class BatchedSolver(Solver):
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
         """
-        :param instances: ``batch`` instances, trimmed to the largest of them
+        :param instances: ``batch`` instances, trimmed to the largest of them and without the tasks that cannot count
         :param rows: Their indices in what is being solved, on which random numbers depend
         :param seed: Of all the randomness
         :param time_limit: Seconds per instance, on average, for solvers that use it
@@ -53,20 +57,29 @@ class BatchedSolver(Solver):
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
     ) -> Iterator[tuple[int, SolverResult]]:
         self.check(instances)
-        fitting = self.rows_that_fit(instances)
-        batch_size = min(self.batch_size or fitting, fitting)
-        for first in range(0, len(rows), batch_size):
-            taken = list(rows[first : first + batch_size])
-            start = time.perf_counter()
-            batch = instances[taken]
-            n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
-            found = self.solve_batch(batch.trim(n_tasks), taken, seed, time_limit)
-            seconds = (time.perf_counter() - start) / len(taken)
-            for row, schedule in zip(taken, found, strict=True):
-                yield row, SolverResult(schedule, seconds, len(taken))
+        if len(rows) == 0:
+            return
+        counting = CountingTasks.of(instances[list(rows)])
+        fleets = counting.n_useful_uavs() if self.serves_any_fleet else [instances.n_uavs] * len(rows)
+        # Batch by batch of equal fleets, so that what is found for an instance does not depend on its batch.
+        for n_uavs in dict.fromkeys(fleets):
+            group = replace(counting.instances, n_uavs=n_uavs)
+            places = [place for place, fleet in enumerate(fleets) if fleet == n_uavs]
+            fitting = self.rows_that_fit(group)
+            batch_size = min(self.batch_size or fitting, fitting)
+            for first in range(0, len(places), batch_size):
+                taken = places[first : first + batch_size]
+                start = time.perf_counter()
+                batch = group[taken]
+                n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
+                found = self.solve_batch(batch.trim(n_tasks), [rows[place] for place in taken], seed, time_limit)
+                seconds = (time.perf_counter() - start) / len(taken)
+                for place, schedule in zip(taken, found, strict=True):
+                    yield rows[place], SolverResult(counting.schedule(place, schedule), seconds, len(taken))
 
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
-        return [result for _, result in self.solve_rows(instances, range(len(instances)), time_limit, seed)]
+        results = dict(self.solve_rows(instances, range(len(instances)), time_limit, seed))
+        return [results[row] for row in range(len(instances))]
 
 
 def parameters_hash(policy: EpisodicPolicy) -> str:

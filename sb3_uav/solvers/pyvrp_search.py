@@ -15,6 +15,7 @@ from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after
+from sb3_uav.solvers.overlong_tours import with_feasible_tours
 
 # Its interface changes with every minor version.
 SUPPORTED_VERSION = "0.14."
@@ -143,11 +144,8 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
             if initial is None
             else pyvrp.Solution(data, [[node - 1 for node in route] for route in reduced.routes(initial)]),
         ).best
-    return reduced.schedule(
-        [activity.idx + 1 for activity in route if activity.is_client()]
-        for route in best.routes()
-        if not route.has_excess_distance()
-    )
+    routes = [[activity.idx + 1 for activity in route if activity.is_client()] for route in best.routes()]
+    return reduced.schedule(with_feasible_tours(reduced, routes))
 
 
 def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> Any:
@@ -157,7 +155,7 @@ def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> A
     :param prizes: ``(n,)`` int64
     :return: PyVRP's description of it; client ``i`` is node ``i + 1``
     """
-    distances = reduced.integer_distances()
+    distances = reduced.coarse_distances()
     return pyvrp.ProblemData(
         # All distances are in the matrix.
         locations=[pyvrp.Location(0, 0)] * len(distances),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import NoneType, UnionType
@@ -33,7 +34,8 @@ def make_solver(spec: str, **defaults: Any) -> Solver:
     Make a solver from text.
 
     :param spec: ``name`` or ``name:key=value,key=value``; the keys are the arguments of the solver's constructor, and
-        ``name``, which tables and files shall call it by
+        ``name``, the label in tables and files. A value with a comma stands in quotes, ``key="a,b"`` or ``key='a,b'``, in
+        which the quote itself is written twice
     :param defaults: Arguments for solvers that have them, where ``spec`` does not give them
     :return: The solver; unless told otherwise its ``name`` is the whole ``spec``, so that variants can be told apart
     :raises ValueError: If the name, a key or a value is not allowed; the message lists the choices
@@ -65,8 +67,37 @@ def solver_label(spec: str) -> str:
     :param spec: As of :func:`make_solver`
     :return: What tables and files call the solver: the option ``name``, or the whole text
     """
-    options = dict(item.partition("=")[::2] for item in spec.partition(":")[2].split(","))
+    try:
+        options = dict(item.partition("=")[::2] for item in _split_options(spec.partition(":")[2]))
+    except ValueError:
+        return spec
     return options.get("name") or spec
+
+
+def _split_options(text: str) -> list[str]:
+    """
+    :param text: ``key=value,key=value``, values with commas in quotes
+    :return: Each ``key=value``, without the quotes
+    :raises ValueError: If a closing quote is missing, or something other than a comma follows it
+    """
+    items = []
+    while text:
+        plain = re.match(r"[^,=]*=?", text)
+        assert plain is not None
+        value = text[plain.end() :]
+        if plain[0].endswith("=") and value[:1] in ("'", '"'):
+            quote = value[0]
+            quoted = re.match(f"{quote}((?:[^{quote}]|{quote}{quote})*){quote}(,|$)", value)
+            if quoted is None:
+                raise ValueError(
+                    f"The value of {text!r} begins with a quote; end it with another one, followed by a comma or by nothing."
+                )
+            items.append(plain[0] + quoted[1].replace(quote * 2, quote))
+            text = value[quoted.end() :]
+        else:
+            item, _, text = text.partition(",")
+            items.append(item)
+    return [item for item in items if item]
 
 
 def _parse_options(name: str, text: str, factory: Callable[..., Solver], defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,7 +113,7 @@ def _parse_options(name: str, text: str, factory: Callable[..., Solver], default
     choices = {key: _plain_type(parameter.annotation) for key, parameter in parameters.items()} | {"name": str}
     known = ", ".join(f"{option}=<{hint.__name__}>" for option, hint in sorted(choices.items()))
     options: dict[str, Any] = {}
-    for item in filter(None, text.split(",")):
+    for item in _split_options(text):
         key, equals, value = item.partition("=")
         if not equals or key not in choices:
             raise ValueError(f"Solver {name!r} has no option {item!r}; its options are: {known}.")

@@ -27,9 +27,13 @@ class UnavailableSolver(Solver):
         self.reason = reason
         try:
             self.uses_time_limit = getattr(solver_factory(spec), "uses_time_limit", True)
-        except ImportError:
+        except (ImportError, ValueError):
             # Not even its class is known.
             self.uses_time_limit = True
+
+    def settings(self) -> None:
+        """Nothing is known that results could depend on."""
+        return None
 
     def check(self, instances: Instances) -> None:
         raise ValueError(self.reason)

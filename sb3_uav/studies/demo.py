@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from sb3_uav.common.random_streams import TEST_SEED
+from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
 from sb3_uav.envs import TaskAllocationEnv
 from sb3_uav.evaluation import evaluate, print_table
 from sb3_uav.evaluation.results import RESULTS_FILE
@@ -45,7 +45,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     """
     environment = gym.make(env_id).unwrapped
     assert isinstance(environment, TaskAllocationEnv)
-    instances = environment.problem.generator(n_instances, np.random.default_rng(TEST_SEED))
+    instances = environment.problem.generator(n_instances, keyed_generator(TEST_SEED))
     instances.save(out / "instances.npz")
 
     allocator = load_policy(run / f"{env_id}.zip", expected=AllocatorPolicy)

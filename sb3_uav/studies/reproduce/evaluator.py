@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from sb3_uav.common.random_streams import TEST_SEED
+from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.run import evaluate
@@ -70,7 +68,7 @@ class Evaluator:
         generator = UniformGenerator(self.scale.n_tasks(scenario), scenario.n_uavs, max_distance=self.scale.max_distance)
         n_instances = self.scale.n_instances[scenario.n_tasks] if n_instances is None else n_instances
         key = (TEST_SEED, self.seed) if seed is None else (seed,)
-        return generator(n_instances, np.random.default_rng([*key, scenario.n_uavs, scenario.n_tasks]))
+        return generator(n_instances, keyed_generator(*key, scenario.n_uavs, scenario.n_tasks))
 
     def run(
         self, scenario: Scenario, solvers: Sequence[Solver], instances: Instances | None = None, folder: str = ""

@@ -7,14 +7,14 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from sb3_uav.registration import GENERALISATION_SIZES, PAPER_FLEETS, PAPER_SIZES
+from sb3_uav.registration import GENERALIZATION_SIZES, PAPER_FLEETS, PAPER_SIZES
 from sb3_uav.training.its_schedule import ALTERNATE_ONLY, ITS, NO_INTENSIVE, NO_PRETRAINING, PAPER_STRATEGIES
 
 FLEETS = PAPER_FLEETS
 # Numbers of tasks in Tables I to III and in all figures.
 SIZES = PAPER_SIZES
 # Numbers of tasks in Table IV, which ends at 1000 in the paper.
-LARGER_SIZES = GENERALISATION_SIZES
+LARGER_SIZES = GENERALIZATION_SIZES
 # Training instances of an epoch.
 INSTANCES_PER_EPOCH = 1_280_000
 MAX_DISTANCE = 2.0
