@@ -18,13 +18,9 @@ import pytest
 import torch as th
 from its_logs import LOG
 from PIL import Image
-
-from sb3_uav.cli import main as cli
-from sb3_uav.evaluation.summary import gaps
-from sb3_uav.policies.loading import load_policy
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
-from sb3_uav.studies.reproduce.pairs import Models
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
+from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
     LARGER_METHODS,
@@ -34,9 +30,13 @@ from sb3_uav.studies.reproduce.paper import (
     SIZES,
     paper_figure,
 )
-from sb3_uav.studies.reproduce.scales import SMOKE, Scenario, scenarios
-from sb3_uav.studies.reproduce.targets import TARGETS
-from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.reproduce.scales import SMOKE, Scenario, scenarios
+from sb3_uav.reproduce.targets import TARGETS
+from sb3_uav.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+
+from sb3_uav.cli import main as cli
+from sb3_uav.evaluation.summary import gaps
+from sb3_uav.policies.loading import load_policy
 from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
@@ -301,7 +301,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def no_licence(spec: str, **_: Any) -> Any:
         raise ValueError(f"{spec}: no licence")
 
-    monkeypatch.setattr("sb3_uav.studies.reproduce.evaluator.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.reproduce.evaluator.make_solver", no_licence)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_uav.common.optional import require
-from sb3_uav.studies.reproduce.scales import SCALES
-from sb3_uav.studies.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
+from sb3_uav.reproduce.scales import SCALES
+from sb3_uav.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
 from sb3_uav.zoo.dependencies import require_zoo
 
 if TYPE_CHECKING:
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.session import Session
 
 EPILOG = """\
 what is written:
@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     out = args.out or Path("reproduction") / args.scale
     if args.redraw:
-        from sb3_uav.studies.reproduce.output_files import redraw
+        from sb3_uav.reproduce.output_files import redraw
 
         for path in redraw(out, names):
             print(path)
@@ -148,10 +148,10 @@ def _make_session(
     """
     import torch as th
 
-    from sb3_uav.studies.reproduce.evaluator import Evaluator
-    from sb3_uav.studies.reproduce.origin import Origin
-    from sb3_uav.studies.reproduce.pairs import Models
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.evaluator import Evaluator
+    from sb3_uav.reproduce.origin import Origin
+    from sb3_uav.reproduce.pairs import Models
+    from sb3_uav.reproduce.session import Session
 
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)

@@ -7,14 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-
-from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.schedule import Schedule, check_schedule
-from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
-from sb3_uav.studies.reproduce.evaluator import complete
-from sb3_uav.studies.reproduce.pairs import LEVELS, Model, read_log
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
+from sb3_uav.reproduce.evaluator import complete
+from sb3_uav.reproduce.pairs import LEVELS, Model, read_log
+from sb3_uav.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
     ABLATION_STRATEGIES,
@@ -24,10 +20,14 @@ from sb3_uav.studies.reproduce.paper import (
     SIZES,
     STRATEGY_TITLES,
 )
-from sb3_uav.studies.reproduce.scales import Scenario, scenarios
-from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, number
-from sb3_uav.studies.reproduce.tables_1_to_4 import trained_pairs
+from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.session import Notes, Session
+from sb3_uav.reproduce.table_formats import MISSING, Column, Table, number
+from sb3_uav.reproduce.tables_1_to_4 import trained_pairs
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule, check_schedule
+from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 _LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from sb3_uav.evaluation.summary import SummaryRow, gaps
-from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.evaluator import BASELINES, complete
-from sb3_uav.studies.reproduce.pairs import Model, read_log
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.evaluator import BASELINES, complete
+from sb3_uav.reproduce.pairs import Model, read_log
+from sb3_uav.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
     FULL_BLOCK,
@@ -31,9 +29,12 @@ from sb3_uav.studies.reproduce.paper import (
     paper_figure,
     paper_tables,
 )
-from sb3_uav.studies.reproduce.scales import Scenario, scenarios
-from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import Column, Table, number
+from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.session import Notes, Session
+from sb3_uav.reproduce.table_formats import Column, Table, number
+
+from sb3_uav.evaluation.summary import SummaryRow, gaps
+from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 PAPER, OURS = "paper", "ours"
