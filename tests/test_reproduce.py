@@ -18,6 +18,10 @@ import pytest
 import torch as th
 from its_logs import LOG
 from PIL import Image
+
+from sb3_uav.cli import main as cli
+from sb3_uav.evaluation.summary import gaps
+from sb3_uav.policies.loading import load_policy
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
 from sb3_uav.reproduce.pairs import Models
 from sb3_uav.reproduce.paper import (
@@ -33,10 +37,6 @@ from sb3_uav.reproduce.paper import (
 from sb3_uav.reproduce.scales import SMOKE, Scenario, scenarios
 from sb3_uav.reproduce.targets import TARGETS
 from sb3_uav.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
-
-from sb3_uav.cli import main as cli
-from sb3_uav.evaluation.summary import gaps
-from sb3_uav.policies.loading import load_policy
 from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 

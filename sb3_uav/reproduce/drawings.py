@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from sb3_uav.reproduce.paper import SIZES
-from sb3_uav.reproduce.table_formats import MISSING, Table
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.render import require_matplotlib
@@ -16,6 +14,8 @@ from sb3_uav.evaluation.summary import gaps
 from sb3_uav.plots.figure_files import new_figure
 from sb3_uav.plots.schedule_map import MapPanel, schedules_figure
 from sb3_uav.plots.style import MARKERS, MAX_MARKERS, ORANGE, PURPLE, SERIES_COLORS, VERMILION, style_axes
+from sb3_uav.reproduce.paper import SIZES
+from sb3_uav.reproduce.table_formats import MISSING, Table
 
 _MAPS_PER_LINE = 3
 DEPOT = "depot"

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_uav.evaluation.summary import SummaryRow, gaps
 from sb3_uav.reproduce.evaluator import BASELINES, complete
 from sb3_uav.reproduce.pairs import Model, read_log
 from sb3_uav.reproduce.paper import (
@@ -32,8 +33,6 @@ from sb3_uav.reproduce.paper import (
 from sb3_uav.reproduce.scales import Scenario, scenarios
 from sb3_uav.reproduce.session import Notes, Session
 from sb3_uav.reproduce.table_formats import Column, Table, number
-
-from sb3_uav.evaluation.summary import SummaryRow, gaps
 from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 

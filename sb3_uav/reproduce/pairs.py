@@ -17,7 +17,6 @@ from sb3_uav.reproduce.pair_training import (
 )
 from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.reproduce.training_processes import train_pairs
-
 from sb3_uav.training.its_schedule import ALTERNATE_ONLY, INDEPENDENT, ITS, NO_INTENSIVE, NO_PRETRAINING
 
 LEVELS = ("allocator", "router")

@@ -6,13 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.plots.figure_files import save_figure
 from sb3_uav.reproduce.drawings import DRAWINGS
 from sb3_uav.reproduce.origin import Origin
 from sb3_uav.reproduce.table_formats import Table, read_csv, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.table_layout import lay_out
-
-from sb3_uav.common.files import replaced_when_complete
-from sb3_uav.plots.figure_files import save_figure
 
 _TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
 _FIGURE_SUFFIXES = (".png", ".pdf")

@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule, check_schedule
 from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
 from sb3_uav.reproduce.evaluator import complete
 from sb3_uav.reproduce.pairs import LEVELS, Model, read_log
@@ -24,9 +27,6 @@ from sb3_uav.reproduce.scales import Scenario, scenarios
 from sb3_uav.reproduce.session import Notes, Session
 from sb3_uav.reproduce.table_formats import MISSING, Column, Table, number
 from sb3_uav.reproduce.tables_1_to_4 import trained_pairs
-
-from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.schedule import Schedule, check_schedule
 from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
