@@ -14,6 +14,10 @@ import numpy as np
 import pytest
 import torch as th
 from its_logs import LOG
+
+from sb3_uav.cli import main as cli
+from sb3_uav.evaluation.summary import gaps
+from sb3_uav.reproduce import paper
 from sb3_uav.reproduce.evaluator import Evaluator
 from sb3_uav.reproduce.figures_3_to_7 import read_logged_curves
 from sb3_uav.reproduce.origin import Origin
@@ -24,10 +28,6 @@ from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario,
 from sb3_uav.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.table_layout import best, lay_out
 from sb3_uav.reproduce.tables_1_to_4 import phase_times, seconds
-
-from sb3_uav.cli import main as cli
-from sb3_uav.evaluation.summary import gaps
-from sb3_uav.reproduce import paper
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS, NO_INTENSIVE
 
 pytest.importorskip("rl_zoo3")

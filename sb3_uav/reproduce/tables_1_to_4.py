@@ -37,7 +37,7 @@ from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 PAPER, OURS = "paper", "ours"
-FASTEST_SHOWN = 0.1
+_FASTEST_SHOWN = 0.1
 
 
 class PhaseTimes(NamedTuple):
@@ -61,7 +61,7 @@ def seconds(value: float | None) -> str:
     :param value: A time
     :return: Text for a cell, with more digits for short times
     """
-    return number(value, 2 if value is None or math.isnan(value) or value >= FASTEST_SHOWN else 4)
+    return number(value, 2 if value is None or math.isnan(value) or value >= _FASTEST_SHOWN else 4)
 
 
 # ---------------------------------------------------------------------------------------------------------------- Table I
