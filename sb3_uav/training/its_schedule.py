@@ -2,12 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-# The paper's names (Fig. 5); "independent" is DL-DRL-I.
-STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive", "independent")
+ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY, INDEPENDENT = STRATEGIES = (
+    "its",
+    "no-pretraining",
+    "no-intensive",
+    "alternate-only",
+    "independent",
+)
+# The paper's names (Fig. 5), in which a slash means "without".
+PAPER_STRATEGIES = {
+    "ITS": ITS,
+    "ITS/pre-training": NO_PRETRAINING,
+    "ITS/intensive": NO_INTENSIVE,
+    "ITS/pre-training&intensive": ALTERNATE_ONLY,
+    "DL-DRL-I": INDEPENDENT,
+}
 
 PRETRAINING, INTENSIVE, ALTERNATE = "pre-training", "intensive", "alternate"
+
+
+def strategy_name(strategy: str) -> str:
+    """
+    :param strategy: One of :data:`STRATEGIES`, or its name in the paper
+    :return: The former
+    :raises ValueError: If there is no such strategy
+    """
+    name = PAPER_STRATEGIES.get(strategy, strategy) if isinstance(strategy, str) else None
+    if name not in STRATEGIES:
+        paper = ", ".join(PAPER_STRATEGIES)
+        raise ValueError(
+            f"strategy is {strategy!r}; choose one of {', '.join(STRATEGIES)} (in the paper's words, in this order: {paper})."
+        )
+    return name
 
 
 @dataclass(frozen=True)
@@ -26,12 +54,12 @@ class EpochSchedule:
     n_pretraining_epochs: int
     n_intensive_epochs: int
     n_continuous_epochs: int
-    is_independent: bool
+    is_independent: bool = False
 
     @classmethod
     def of(cls, strategy: str, n_epochs: int, n_pretraining: int, n_intensive: int, n_continuous: int) -> EpochSchedule:
         """
-        :param strategy: One of :data:`STRATEGIES`
+        :param strategy: One of :data:`STRATEGIES`, or its name in the paper
         :param n_epochs: Allocator epochs
         :param n_pretraining: Router epochs of pre-training, if the strategy has it
         :param n_intensive: Allocator epochs of intensive training, if the strategy has it
@@ -39,15 +67,23 @@ class EpochSchedule:
         :return: The schedule
         :raises ValueError: If there is no such strategy
         """
-        if strategy not in STRATEGIES:
-            raise ValueError(f"strategy is {strategy!r}; choose one of {STRATEGIES}.")
+        strategy = strategy_name(strategy)
+        if strategy == INDEPENDENT:
+            # Both models of DL-DRL-I are trained as long as those of DL-DRL.
+            whole = cls.of(ITS, n_epochs, n_pretraining, n_intensive, n_continuous)
+            return replace(whole, n_pretraining_epochs=whole.n_router_epochs, is_independent=True)
         return cls(
             n_epochs,
-            0 if strategy.startswith("ITS/pre-training") else n_pretraining,
-            0 if strategy.endswith("intensive") else n_intensive,
+            0 if strategy in (NO_PRETRAINING, ALTERNATE_ONLY) else n_pretraining,
+            0 if strategy in (NO_INTENSIVE, ALTERNATE_ONLY) else n_intensive,
             n_continuous,
-            strategy == "independent",
         )
+
+    @property
+    def n_router_epochs(self) -> int:
+        """Epochs of the router in all: before the allocator's first epoch, and after each of them."""
+        later = sum(self.router_epochs_after(epoch) for epoch in range(1, self.n_epochs + 1))
+        return self.n_pretraining_epochs + later
 
     def phase(self, epoch: int) -> str:
         """
