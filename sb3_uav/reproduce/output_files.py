@@ -13,8 +13,8 @@ from sb3_uav.reproduce.origin import Origin
 from sb3_uav.reproduce.table_formats import Table, read_csv, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.table_layout import lay_out
 
-TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
-FIGURE_SUFFIXES = (".png", ".pdf")
+_TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
+_FIGURE_SUFFIXES = (".png", ".pdf")
 
 
 def write_files(table: Table, origin: Origin, folder: Path, name: str, drawn: Table | None = None) -> list[Path]:
