@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_uav.common.statistics import confidence_halfwidth
-from sb3_uav.studies.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
+from sb3_uav.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
 
 REFERENCE = "ortools"
 

@@ -119,7 +119,7 @@ def test_nothing_changes_where_all_tasks_count() -> None:
     assert CountingTasks.of(batch).instances is batch
 
 
-@pytest.mark.parametrize("n_uavs", [10**6, 10**9, 2**62])
+@pytest.mark.parametrize("n_uavs", [10**6, 10**9])
 @pytest.mark.parametrize("spec", [*SPECS, *NETWORKS[:-1]])
 def test_absurd_fleets_cost_no_memory(spec: str, n_uavs: int, ticks: Ticks) -> None:
     """At most one UAV per task can be of use, so that all solvers see all the tasks visited, each by a UAV of its own."""

@@ -25,12 +25,12 @@ from sb3_uav.solvers import SOLVERS
 def test_going_on_after_ctrl_c(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was found stays; the same call goes on from there, and --overwrite starts anew."""
+    """Results stay; the same command resumes, and --overwrite starts over."""
     common = ("--instances", inputs.small, "--out", tmp_path, "--solvers", "random-nearest")
     monkeypatch.setitem(SOLVERS, "halting", "evaluate_cli_helpers:Interrupted")
     assert run(*common, "halting") == 130
     message = capsys.readouterr().err
-    assert f"{tmp_path} holds the results so far; the same command goes on from there" in message
+    assert f"{tmp_path} holds the results so far; run the same command again to resume" in message
     assert message.endswith("sb3-uav evaluate: interrupted\n")
     before = (tmp_path / "results.csv").read_text()
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
@@ -94,17 +94,17 @@ def test_solvers_that_fail_leave_the_others(
     ]
 
 
-def test_gurobi_without_a_licence(
+def test_gurobi_without_a_license(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The others are evaluated."""
     pytest.importorskip("gurobipy")
-    licence = tmp_path / "gurobi.lic"
-    licence.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
-    monkeypatch.setenv("GRB_LICENSE_FILE", str(licence))
+    license = tmp_path / "gurobi.lic"
+    license.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
+    monkeypatch.setenv("GRB_LICENSE_FILE", str(license))
     arguments = ("--instances", inputs.small, "--out", tmp_path / "out", "--time-limit", 1)
     assert run(*arguments, "--solvers", "random-nearest", "milp:backend=gurobi,name=exact") == 3
-    assert "sb3-uav: exact failed on 4 of 4 instances of U3-N20: Gurobi found no valid licence" in capsys.readouterr().err
+    assert "sb3-uav: exact failed on 4 of 4 instances of U3-N20: Gurobi found no valid license" in capsys.readouterr().err
     assert [row["status"] for row in read_results(tmp_path / "out")] == ["ok"] * 4 + ["failed"] * 4
 
 

@@ -20,7 +20,7 @@ from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.evaluation import evaluate
 from sb3_uav.solvers import NoScheduleError, make_solver
 from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
-from sb3_uav.solvers.programs import FREE_LICENCE_SIZE, Answer, Backend
+from sb3_uav.solvers.programs import FREE_LICENSE_SIZE, Answer, Backend
 from sb3_uav.solvers.unavailable import UnavailableError
 
 pytestmark = pytest.mark.usefixtures("ticks")
@@ -128,8 +128,8 @@ def test_size_of_the_program(n_tasks: int, n_uavs: int) -> None:
 
 
 @pytest.mark.parametrize("n_uavs, largest", [(2, 30), (4, 20), (6, 16)])
-def test_sizes_of_the_free_licence(n_uavs: int, largest: int) -> None:
-    assert max(program_size(largest, n_uavs)) <= FREE_LICENCE_SIZE < max(program_size(largest + 1, n_uavs))
+def test_sizes_of_the_free_license(n_uavs: int, largest: int) -> None:
+    assert max(program_size(largest, n_uavs)) <= FREE_LICENSE_SIZE < max(program_size(largest + 1, n_uavs))
 
 
 def test_too_large_for_any_machine() -> None:
@@ -140,29 +140,29 @@ def test_too_large_for_any_machine() -> None:
             action(instance)
 
 
-def test_gurobi_and_its_licence() -> None:
-    """Both backends agree; beyond the free licence there is a clear message, before any solving and during it."""
+def test_gurobi_and_its_license() -> None:
+    """Both backends agree; beyond the free license there is a clear message, before any solving and during it."""
     gurobipy = pytest.importorskip("gurobipy")
     solver: Any = make_solver("milp:backend=gurobi")
     batch = UniformGenerator(7, n_uavs=2, max_distance=1.2)(4, np.random.default_rng(0))
     for row in range(4):
         (gurobi, result), (highs, _) = solved(solver, batch, row), solved("milp", batch, row)
         assert gurobi == highs == pytest.approx(result.bound)
-    if solver.backend.size_limit != FREE_LICENCE_SIZE:
-        pytest.skip(f"gurobipy {gurobipy.gurobi.version()} has a full licence here")
+    if solver.backend.size_limit != FREE_LICENSE_SIZE:
+        pytest.skip(f"gurobipy {gurobipy.gurobi.version()} has a full license here")
     large = Instances.concatenate([batch.pad(40), UniformGenerator(40, 2, max_distance=9.0)(1, np.random.default_rng(0))])
     with pytest.raises(
-        ValueError, match=r"instance 4: the model has 3440 variables .* free licence admits.*milp:backend=highs"
+        ValueError, match=r"instance 4: the model has 3440 variables .* free license admits.*milp:backend=highs"
     ):
         solver.check(large)
-    with pytest.raises(ValueError, match="free licence admits"):
+    with pytest.raises(ValueError, match="free license admits"):
         solver.solve(large[4:])
 
 
-def test_gurobi_without_a_licence(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def test_gurobi_without_a_license(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     pytest.importorskip("gurobipy")
-    licence = tmp_path / "gurobi.lic"
-    licence.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
-    monkeypatch.setenv("GRB_LICENSE_FILE", str(licence))
-    with pytest.raises(UnavailableError, match=r"Gurobi found no valid licence .* or use milp:backend=highs"):
+    license = tmp_path / "gurobi.lic"
+    license.write_text("EXPIRATION=2001-01-01\nKEY=00000000\n")
+    monkeypatch.setenv("GRB_LICENSE_FILE", str(license))
+    with pytest.raises(UnavailableError, match=r"Gurobi found no valid license .* or use milp:backend=highs"):
         make_solver("milp:backend=gurobi")

@@ -63,7 +63,7 @@ def test_threads_change_nothing(instances: Instances, monkeypatch: pytest.Monkey
 
 
 def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a clock that goes on when something is sampled, and a little whenever it is looked at."""
+    """With a clock that advances by each sample, and a little whenever it is read."""
     pair = make_pair(decode="sampling", samples=64, repair=True, polish=9.0)
     drawn: list[int] = []
     spent: list[float] = []

@@ -22,9 +22,9 @@ from PIL import Image
 from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
-from sb3_uav.studies.reproduce.pairs import Models
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
+from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
     LARGER_METHODS,
@@ -34,9 +34,9 @@ from sb3_uav.studies.reproduce.paper import (
     SIZES,
     paper_figure,
 )
-from sb3_uav.studies.reproduce.scales import SMOKE, Scenario, scenarios
-from sb3_uav.studies.reproduce.targets import TARGETS
-from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.reproduce.scales import SMOKE, Scenario, scenarios
+from sb3_uav.reproduce.targets import TARGETS
+from sb3_uav.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
 from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
@@ -287,7 +287,7 @@ def test_own_pairs(out: Path, tmp_path: Path, threads: None, capsys: pytest.Capt
     assert any("There is no pair for U4-500, and --no-training forbids training one" in comment for comment in comments)
     _, rows, comments = read_table(results / "fig7.csv")
     assert [row["Method"] for row in rows] == ["U6"]
-    assert any("K-means+VND was not asked for" in comment for comment in comments)
+    assert any("K-means+VND was not requested" in comment for comment in comments)
     assert not (results / "models").exists() and "training 1" not in capsys.readouterr().err
     (models / "U4-N80/ITS/router.zip").unlink()
     assert run("fig3", "--scale", "smoke", "--models", models, "--no-training", "--out", results) == 2
@@ -301,7 +301,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def no_licence(spec: str, **_: Any) -> Any:
         raise ValueError(f"{spec}: no licence")
 
-    monkeypatch.setattr("sb3_uav.studies.reproduce.evaluator.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.reproduce.evaluator.make_solver", no_licence)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")
@@ -393,7 +393,7 @@ def test_pairs_of_other_settings_are_not_used(out: Path, tmp_path: Path) -> None
     [
         (["table1", "--models", "nowhere"], "--models nowhere: no such folder; give one that holds U4-N80/ITS/allocator.zip"),
         (["table1", "--solvers", "gurobi"], "--solvers: 'gurobi' is not one of ["),
-        (["table1", "--solvers", "dl-drl"], "trained pairs are always there"),
+        (["table1", "--solvers", "dl-drl"], "trained pairs are always included"),
         (["table1", "--solvers", "kmeans-am", "kmeans-am"], "names 'kmeans-am' twice"),
         (["table1", "--jobs", "0"], "--jobs is 0; it must be at least 1"),
         (["table1", "--seed", "-1"], "--seed is -1; it must be at least 0"),

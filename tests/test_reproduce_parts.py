@@ -17,17 +17,17 @@ from its_logs import LOG
 
 from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
-from sb3_uav.studies.reproduce import paper
-from sb3_uav.studies.reproduce.evaluator import Evaluator
-from sb3_uav.studies.reproduce.figures_3_to_7 import read_logged_curves
-from sb3_uav.studies.reproduce.origin import Origin
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
-from sb3_uav.studies.reproduce.pairs import Model
-from sb3_uav.studies.reproduce.paper import paper_figure, paper_tables
-from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario, scenarios
-from sb3_uav.studies.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
-from sb3_uav.studies.reproduce.table_layout import best, lay_out
-from sb3_uav.studies.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.reproduce import paper
+from sb3_uav.reproduce.evaluator import Evaluator
+from sb3_uav.reproduce.figures_3_to_7 import read_logged_curves
+from sb3_uav.reproduce.origin import Origin
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
+from sb3_uav.reproduce.pairs import Model
+from sb3_uav.reproduce.paper import paper_figure, paper_tables
+from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario, scenarios
+from sb3_uav.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
+from sb3_uav.reproduce.table_layout import best, lay_out
+from sb3_uav.reproduce.tables_1_to_4 import phase_times, seconds
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS, NO_INTENSIVE
 
 pytest.importorskip("rl_zoo3")

@@ -36,7 +36,7 @@ def dyadic(offset: float = 0.0, n_tasks: int = 6) -> Instances:
 
 
 @pytest.mark.parametrize("offset", [1e6, -3e8])
-@pytest.mark.parametrize("spec", SPECS)
+@pytest.mark.parametrize("spec", [*SPECS, *NETWORKS])
 def test_far_from_the_origin_nothing_changes(spec: str, offset: float, ticks: Ticks) -> None:
     solver = make(spec)
     ticks.looks = 0

@@ -24,7 +24,7 @@ from sb3_uav.zoo.configs import check_keys, read_yaml
         (dict(policy_kwargs=dict(preset="papper")), "preset is 'papper'"),
         (its_with(n_epoch=3), "an argument of 'callback' does not fit"),
         (its_with(strategy="none"), "strategy is 'none'"),
-        (dict(policy_kwargs=dict(embed_dims=8)), "unexpected keyword argument 'embed_dims'"),
+        (dict(policy_kwargs=dict(embed_dims=8)), "embed_dims"),
         (dict(policy="sb3_uav.policies.AlocatorPolicy"), "AlocatorPolicy"),
         (its_with(router=dict(policy="RouterPolicy", n_stepz=3)), "these arguments do not fit algorithm 'reinforce'"),
     ],

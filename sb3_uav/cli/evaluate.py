@@ -29,7 +29,7 @@ files in DIR:
   results.csv, schedules.jsonl    one line per solver and instance, written as soon as it is known
   summary.csv, summary.json       the table, with more columns
   evaluation.json                 solvers, hashes of instances and zips, seeds, versions of packages
-  The same call goes on where an interrupted one stopped, and further calls add solvers, time limits and seeds.
+  Rerun the same command to resume an interrupted run; further runs add solvers, time limits and seeds.
 
 exit code:
   0    all schedules are feasible
@@ -72,7 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="start anew, instead of going on with the results in DIR")
+    parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
     networks = parser.add_argument_group("networks")
     networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
     networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
@@ -223,7 +223,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 resume=not args.overwrite,
             )
     except KeyboardInterrupt:
-        print(f"sb3-uav: {args.out} holds the results so far; the same command goes on from there.", file=sys.stderr)
+        print(f"sb3-uav: {args.out} holds the results so far; run the same command again to resume.", file=sys.stderr)
         raise
     print_table(summary)
     # A solver that uses no time limit stands in the summary of each.

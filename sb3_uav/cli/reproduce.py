@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_uav.common.optional import require
-from sb3_uav.studies.reproduce.scales import SCALES
-from sb3_uav.studies.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
+from sb3_uav.reproduce.scales import SCALES
+from sb3_uav.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
 from sb3_uav.zoo.dependencies import require_zoo
 
 if TYPE_CHECKING:
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.session import Session
 
 EPILOG = """\
 what is written:
@@ -37,7 +37,7 @@ what is written:
 """
 
 
-def indented(name: str, text: str) -> str:
+def _indented(name: str, text: str) -> str:
     """
     :param name: Name of a scale
     :param text: Its description
@@ -51,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog="sb3-uav reproduce",
         description="Reproduce tables and figures of the DL-DRL paper: train missing pairs, evaluate them beside "
         "the paper's baselines, and write our figures beside the paper's.",
-        epilog="\n".join(["scales:", *(indented(scale.name, scale.text) for scale in SCALES.values()), "", EPILOG]),
+        epilog="\n".join(["scales:", *(_indented(scale.name, scale.text) for scale in SCALES.values()), "", EPILOG]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     out = args.out or Path("reproduction") / args.scale
     if args.redraw:
-        from sb3_uav.studies.reproduce.output_files import redraw
+        from sb3_uav.reproduce.output_files import redraw
 
         for path in redraw(out, names):
             print(path)
@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         with ProgressLines() as progress:
-            session = make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
+            session = _make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
             for position, name in enumerate(names):
                 print(f"{name} ({position + 1} of {len(names)}), scale {args.scale}", file=sys.stderr, flush=True)
                 for path in target_functions()[name](session):
@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def make_session(
+def _make_session(
     args: argparse.Namespace, out: Path, command: str, progress: Callable[[str, int, int], None] | None
 ) -> Session:
     """
@@ -148,10 +148,10 @@ def make_session(
     """
     import torch as th
 
-    from sb3_uav.studies.reproduce.evaluator import Evaluator
-    from sb3_uav.studies.reproduce.origin import Origin
-    from sb3_uav.studies.reproduce.pairs import Models
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.evaluator import Evaluator
+    from sb3_uav.reproduce.origin import Origin
+    from sb3_uav.reproduce.pairs import Models
+    from sb3_uav.reproduce.session import Session
 
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)

@@ -276,9 +276,9 @@ class TaskAllocationEnv(ProblemEnv):
     :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
+    :param router: Plans the tours of the reward; nearest feasible task when None
     :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot, which
         allocators with ``sweep`` expect
-    :param router: Plans the tours of the reward; nearest feasible task when None
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
     """
 
@@ -292,8 +292,8 @@ class TaskAllocationEnv(ProblemEnv):
         distribution: str = "uniform",
         instances: Any = None,
         generator: InstanceGenerator | None = None,
-        task_order: str = "input",
         router: Router | None = None,
+        task_order: str = "input",
         render_mode: str | None = None,
     ) -> None:
         generator = generator or make_generator(n_tasks, n_uavs, max_distance, distribution, instances)

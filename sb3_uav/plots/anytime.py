@@ -18,8 +18,8 @@ from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import DASHED, MARKERS, SERIES_COLORS, style_axes
 
 PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
-LEGEND_WIDTH = 34
-FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
+_LEGEND_WIDTH = 34
+_FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
 
 
 class Curve(NamedTuple):
@@ -91,7 +91,7 @@ def plot_anytime(
     figure = new_figure(PANEL_WIDTH, PANEL_HEIGHT * len(panels))
     for axes, panel in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
         _draw_panel(axes, panel, numbers)
-    figure.supxlabel(FOOTNOTE, fontsize=7.5, color="0.4")
+    figure.supxlabel(_FOOTNOTE, fontsize=7.5, color="0.4")
     for path in checked:
         save_figure(figure, path)
     return checked
@@ -184,7 +184,7 @@ def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
     # The legend lists the best solver first, as in the panel.
     for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
         look = solver_style(numbers[curve.solver])
-        name = textwrap.fill(curve.solver.replace(",", ", "), LEGEND_WIDTH, break_on_hyphens=False)
+        name = textwrap.fill(curve.solver.replace(",", ", "), _LEGEND_WIDTH, break_on_hyphens=False)
         label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
         low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth
         if len(curve.seconds) > 1:

@@ -13,7 +13,7 @@ from sb3_uav.envs.schedule import Schedule
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
-LEGEND_LINE_HEIGHT = 0.2
+_LEGEND_LINE_HEIGHT = 0.2
 MAX_COLUMNS = 4
 
 
@@ -73,7 +73,7 @@ def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -
         raise ValueError("There is nothing to draw: give at least one panel.")
     n_columns = min(len(panels), n_columns)
     n_lines = math.ceil(len(panels) / n_columns)
-    height = PANEL_HEIGHT + LEGEND_LINE_HEIGHT * max(legend_lines(panel.schedule.routes) for panel in panels)
+    height = PANEL_HEIGHT + _LEGEND_LINE_HEIGHT * max(legend_lines(panel.schedule.routes) for panel in panels)
     figure = new_figure(PANEL_WIDTH * n_columns, height * n_lines)
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):

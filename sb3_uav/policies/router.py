@@ -114,9 +114,7 @@ class RouterExtractor(EpisodicExtractor):
     The compatibilities are the logits of :class:`RouterPolicy`; other policies may use the features in any way.
 
     :param observation_space: Observation space of a ``RoutePlanning`` environment
-    :param settings: Fields of :class:`~sb3_uav.policies.settings.NetworkSettings`
-    :raises TypeError: If there is no such setting
-    :raises ValueError: If a setting or the observation space is not allowed
+    :param settings: As for :class:`~sb3_uav.policies.allocator.AllocatorExtractor`, with the same errors
     """
 
     environment = "RoutePlanning"

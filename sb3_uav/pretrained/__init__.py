@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+__all__ = ["files", "names", "pair_files"]
+
 DEFAULT_PAIR = "universal"
 ALLOCATOR_FILE, ROUTER_FILE = "allocator.zip", "router.zip"
 

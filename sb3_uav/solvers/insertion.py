@@ -1,4 +1,4 @@
-"""Cheapest insertion: the trivial reference among the solvers that plan all tours at once."""
+"""Cheapest insertion: a simple baseline that plans all tours at once."""
 
 from __future__ import annotations
 

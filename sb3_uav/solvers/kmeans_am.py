@@ -22,10 +22,10 @@ class KMeansAM(BatchedSolver):
     """
     K-means gives every UAV a cluster of tasks, the trained router plans its tour, greedily.
 
-    With the same seed and restarts the clusters are those of ``kmeans-nearest``.
+    With the same seed and number of restarts, the clusters are those of ``kmeans-nearest``.
 
     :param router: The lower level's policy
-    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :param restarts: Number of starts of K-means; the most compact clusters are kept
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :raises ValueError: If an argument is not allowed
     """
@@ -58,7 +58,7 @@ class KMeansAM(BatchedSolver):
 def load_kmeans_am(router: str, restarts: int = 10, device: str = "auto", batch_size: int | None = None) -> KMeansAM:
     """
     :param router: SB3 zip of the router
-    :param restarts: How many times K-means starts anew
+    :param restarts: Number of starts of K-means
     :param device: Device of the network
     :param batch_size: How many instances to solve at once; as many as memory allows when None
     :return: The solver

@@ -67,8 +67,8 @@ class MILP(TimeLimitedSolver):
 
     It is built for what makes it exact: without tasks that no UAV can reach, for which (8) has no solution; with coincident
     tasks as one place, because (7) allows cycles of length 0; and with no more UAVs than places, because (5) sends every UAV
-    out. Tasks count with their value in (1). What a solver's tolerances let through all the same is forbidden, and the program
-    solved again. At the time limit, the best schedule so far is returned with the proven bound; without one,
+    out. Tasks count with their value in (1). Cycles that a solver's tolerances admit nevertheless are forbidden, and the
+    program is solved again. At the time limit, the best schedule so far is returned with the proven bound; without one,
     :class:`~sb3_uav.solvers.base.NoScheduleError` is raised, which holds the bound.
 
     Nothing is added against the symmetry of identical UAVs: that speeds up proofs for ten tasks, but HiGHS then finds no
@@ -79,7 +79,7 @@ class MILP(TimeLimitedSolver):
     :param threads: How many threads the backend may use
     :raises ImportError: If the backend is not installed
     :raises ValueError: If an argument is not allowed
-    :raises UnavailableError: If Gurobi finds no valid licence
+    :raises UnavailableError: If Gurobi finds no valid license
     """
 
     name = "milp"
@@ -95,7 +95,7 @@ class MILP(TimeLimitedSolver):
 
     def check(self, instances: Instances) -> None:
         """
-        :param instances: What is going to be solved
+        :param instances: The instances to solve
         :raises ValueError: If the model of one of them is too large for the backend
         """
         for row in range(len(instances)):

@@ -1,4 +1,4 @@
-"""Solvers that treat many instances at once, as networks do."""
+"""Solvers that solve many instances at once, as networks do."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_uav.solvers.counting_tasks import CountingTasks
 
 class BatchedSolver(Solver):
     """
-    A solver that treats as many instances at once as memory allows.
+    A solver that solves as many instances at once as memory allows.
 
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :raises ValueError: If it is less than 1
@@ -37,8 +37,8 @@ class BatchedSolver(Solver):
     @abstractmethod
     def rows_that_fit(self, instances: Instances) -> int:
         """
-        :param instances: What is being solved
-        :return: How many of them fit into the memory at once, at least 1
+        :param instances: The instances to solve
+        :return: How many of them fit into memory at once, at least 1
         """
 
     @abstractmethod
@@ -47,10 +47,10 @@ class BatchedSolver(Solver):
     ) -> list[Schedule]:
         """
         :param instances: ``batch`` instances, trimmed to the largest of them and without the tasks that cannot count
-        :param rows: Their indices in what is being solved, on which random numbers depend
-        :param seed: Of all the randomness
+        :param rows: Their row indices in the solved batch, on which random numbers depend
+        :param seed: Seed for all random numbers
         :param time_limit: Seconds per instance, on average, for solvers that use it
-        :return: A schedule for each
+        :return: A schedule for each instance
         """
 
     def solve_rows(
@@ -61,7 +61,7 @@ class BatchedSolver(Solver):
             return
         counting = CountingTasks.of(instances[list(rows)])
         fleets = counting.n_useful_uavs() if self.serves_any_fleet else [instances.n_uavs] * len(rows)
-        # Batch by batch of equal fleets, so that what is found for an instance does not depend on its batch.
+        # A batch holds fleets of one size, so that the schedule of an instance does not depend on the others in its batch.
         for n_uavs in dict.fromkeys(fleets):
             group = replace(counting.instances, n_uavs=n_uavs)
             places = [place for place, fleet in enumerate(fleets) if fleet == n_uavs]
@@ -85,11 +85,11 @@ class BatchedSolver(Solver):
 def parameters_hash(policy: EpisodicPolicy) -> str:
     """
     :param policy: Any policy of ours
-    :return: SHA-256 of its parameters and buffers, the same on every device and whatever file they came from
+    :return: SHA-256 of its parameters and buffers, which depends neither on the device nor on the file
     """
     digest = hashlib.sha256()
     for name, value in policy.state_dict().items():
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
-        # As bytes, because numpy has no bfloat16.
+        # As bytes, because NumPy has no bfloat16.
         digest.update(value.detach().cpu().flatten().view(th.uint8).numpy().tobytes())
     return digest.hexdigest()

@@ -48,7 +48,7 @@ class ORToolsGLS(TimeLimitedSolver):
     """
     The same with OR-Tools' guided local search until the time limit.
 
-    It goes on to the limit even when all tasks are visited, because OR-Tools then still shortens the tours.
+    It runs until the limit even when all tasks are visited, because OR-Tools then still shortens the tours.
 
     :param time_limit: Seconds per instance
     :raises ImportError: If OR-Tools is not installed

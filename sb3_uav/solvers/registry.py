@@ -65,7 +65,7 @@ def solver_factory(spec: str) -> Callable[..., Solver]:
 def solver_label(spec: str) -> str:
     """
     :param spec: As of :func:`make_solver`
-    :return: What tables and files call the solver: the option ``name``, or the whole text
+    :return: Label of the solver in tables and files: the option ``name``, or the whole text
     """
     try:
         options = dict(item.partition("=")[::2] for item in _split_options(spec.partition(":")[2]))
@@ -104,7 +104,7 @@ def _parse_options(name: str, text: str, factory: Callable[..., Solver], default
     """
     :param name: Name of the solver, for errors
     :param text: ``key=value,key=value``, or nothing
-    :param factory: A class or a function, whose arguments say which keys there are, and of which type
+    :param factory: A class or a function, whose arguments define the keys and their types
     :param defaults: Arguments where the text does not give them
     :return: The arguments
     :raises ValueError: If a key or a value is not allowed, or one is missing
@@ -120,7 +120,7 @@ def _parse_options(name: str, text: str, factory: Callable[..., Solver], default
         if key in options:
             raise ValueError(f"Solver {name!r} is given the option {key!r} twice.")
         options[key] = _parse_value(f"Option {item!r} of solver {name!r}", value, choices[key])
-    # How it is called is no argument of the solver.
+    # The label is no argument of the solver.
     options.pop("name", None)
     options = {key: value for key, value in defaults.items() if key in parameters} | options
     missing = [key for key, parameter in parameters.items() if parameter.default is parameter.empty and key not in options]
@@ -141,7 +141,7 @@ def _plain_type(hint: Any) -> type:
 
 def _parse_value(what: str, value: str, kind: type) -> Any:
     """
-    :param what: What the value is, named in errors
+    :param what: Description of the value, for errors
     :param value: The text
     :param kind: ``int``, ``float``, ``bool`` or ``str``
     :raises ValueError: If the text is not of that type

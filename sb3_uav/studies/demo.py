@@ -56,7 +56,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
     summary = evaluate(solvers, {env_id: instances}, out / "results", seed)
     print_table(summary)
-    print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
+    _print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
 
     plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
     # The instance with the most central depot shows the tours best.
@@ -80,7 +80,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     return int(any(row.violations for row in summary))
 
 
-def print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
+def _print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
     """
     Print the mean paired difference between our solvers and others.
 

@@ -15,7 +15,7 @@ import sb3_uav
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
 
 # Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
-ZOO_KEYS = {
+_ZOO_KEYS = {
     "n_envs",
     "n_timesteps",
     "normalize",
@@ -90,7 +90,7 @@ def check_keys(found: set[str], algorithm: type, where: str) -> None:
     :param where: File and entry, named in the error
     :raises ValueError: If neither uses a key
     """
-    known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
+    known = _ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
     for key in sorted(found - known, key=str):
         nearest = difflib.get_close_matches(str(key), known, n=1)
         advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sb3_uav.common.optional import require
 
-EXTRA = "zoo"
-MODULES = ("yaml", "rl_zoo3.train")
+_EXTRA = "zoo"
+_MODULES = ("yaml", "rl_zoo3.train")
 
 
 def require_zoo(what: str, *others: str) -> None:
@@ -14,5 +14,5 @@ def require_zoo(what: str, *others: str) -> None:
     :param others: Further modules of the same extra
     :raises ImportError: If one cannot be imported, with the command that installs it
     """
-    for module in (*MODULES, *others):
-        require(module, what, EXTRA)
+    for module in (*_MODULES, *others):
+        require(module, what, _EXTRA)

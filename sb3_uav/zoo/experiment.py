@@ -22,7 +22,7 @@ from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
 # Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
-SETUP_ERRORS = (
+_SETUP_ERRORS = (
     *(TypeError, AttributeError, AssertionError, ModuleNotFoundError, NameError, SyntaxError, LookupError, ArithmeticError),
     *(RuntimeError, MemoryError),
 )
@@ -89,7 +89,7 @@ class UAVExperimentManager(ExperimentManager):
     def setup_experiment(self) -> Any:
         try:
             return super().setup_experiment()
-        except SETUP_ERRORS as error:
+        except _SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
         except ValueError as error:
             if str(self.config) in str(error):
@@ -149,11 +149,11 @@ class UAVExperimentManager(ExperimentManager):
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
                 if self.continue_training and callback.resume_from is None:
-                    callback.resume_from = find_checkpoint(Path(self.trained_agent))
+                    callback.resume_from = _find_checkpoint(Path(self.trained_agent))
 
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
-        kept = [entry for entry in (given if isinstance(given, list) else [given]) if not is_fixed_set_evaluation(entry)]
+        kept = [entry for entry in (given if isinstance(given, list) else [given]) if not _is_fixed_set_evaluation(entry)]
         # By name, so that every trial gets its own instance.
         self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
         try:
@@ -169,7 +169,7 @@ class UAVExperimentManager(ExperimentManager):
         except (RuntimeError, FloatingPointError) as error:
             # rl_zoo3 treats ValueError and AssertionError in training as divergence; torch raises these errors too.
             raise optuna.exceptions.TrialPruned(str(error)) from error
-        except SETUP_ERRORS as error:
+        except _SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
         if not math.isfinite(mean_reward):
             raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
@@ -187,7 +187,7 @@ def _described(error: Exception) -> str:
     return str(error) if isinstance(error, TypeError | AssertionError | ImportError) else f"{type(error).__name__}: {error}"
 
 
-def is_fixed_set_evaluation(entry: Any) -> bool:
+def _is_fixed_set_evaluation(entry: Any) -> bool:
     """
     :param entry: An item of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
     :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which trials do not need
@@ -196,7 +196,7 @@ def is_fixed_set_evaluation(entry: Any) -> bool:
     return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
 
 
-def find_checkpoint(trained_agent: Path) -> Path:
+def _find_checkpoint(trained_agent: Path) -> Path:
     """
     :param trained_agent: The allocator's zip to resume from
     :return: The folder with the state of its interactive training

@@ -26,7 +26,7 @@ except ImportError as error:
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-MakeVecEnv = Callable[[list[Any]], VecEnv]
+_MakeVecEnv = Callable[[list[Any]], VecEnv]
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
 
 
 @contextmanager
-def default_vec_env(make: MakeVecEnv) -> Iterator[None]:
+def default_vec_env(make: _MakeVecEnv) -> Iterator[None]:
     """
     Replace rl_zoo3's default vectorized environment while the ``with`` block lasts.
 
@@ -99,7 +99,7 @@ def default_vec_env(make: MakeVecEnv) -> Iterator[None]:
         yield
 
 
-def set_default_vec_env(make: MakeVecEnv) -> None:
+def set_default_vec_env(make: _MakeVecEnv) -> None:
     """
     Replace rl_zoo3's default vectorized environment.
 

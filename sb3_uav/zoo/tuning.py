@@ -43,13 +43,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.zoo.rl_zoo3_compat import set_search_space
 
-Params = dict[str, Any]
-Converter = Callable[[Params], Params]
+_Params = dict[str, Any]
+_Converter = Callable[[_Params], _Params]
 # Takes the trial (optuna.Trial), the number of actions (for noise), n_envs and arguments for off-policy algorithms.
-Sampler = Callable[[Any, int, int, Params], Params]
+_Sampler = Callable[[Any, int, int, _Params], _Params]
 
 
-def suggest_common(trial: Any) -> Params:
+def _suggest_common(trial: Any) -> _Params:
     """:param trial: Draws the hyperparameters that all algorithms share"""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True),
@@ -58,7 +58,7 @@ def suggest_common(trial: Any) -> Params:
     }
 
 
-def suggest_critic(trial: Any) -> Params:
+def _suggest_critic(trial: Any) -> _Params:
     """:param trial: Draws the hyperparameters of algorithms with a critic"""
     return {
         "gae_lambda": trial.suggest_categorical("gae_lambda", [0.9, 0.95, 0.98, 0.99, 1.0]),
@@ -66,12 +66,12 @@ def suggest_critic(trial: Any) -> Params:
     }
 
 
-def sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """PPO and MaskablePPO on our environments; parameters and result as in rl_zoo3."""
-    hyperparams = convert_powers(
+    hyperparams = _convert_powers(
         {
-            **suggest_common(trial),
-            **suggest_critic(trial),
+            **_suggest_common(trial),
+            **_suggest_critic(trial),
             "batch_size_pow": trial.suggest_int("batch_size_pow", 8, 13),
             "n_epochs": trial.suggest_int("n_epochs", 1, 8),
             "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
@@ -82,21 +82,21 @@ def sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: Params)
     return hyperparams
 
 
-def sample_a2c(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_a2c(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """A2C on our environments; parameters and result as in rl_zoo3."""
     return {
-        **suggest_common(trial),
-        **suggest_critic(trial),
+        **_suggest_common(trial),
+        **_suggest_critic(trial),
         "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
         "use_rms_prop": trial.suggest_categorical("use_rms_prop", [False, True]),
     }
 
 
-def sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """REINFORCE on our environments, playing whole episodes; parameters and result as in rl_zoo3."""
-    return convert_reinforce(
+    return _convert_reinforce(
         {
-            **suggest_common(trial),
+            **_suggest_common(trial),
             "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
             "baseline": trial.suggest_categorical("baseline", ["shared", "rollout", "critic"]),
             "n_samples_pow": trial.suggest_int("n_samples_pow", 1, 4),
@@ -104,11 +104,11 @@ def sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: P
     )
 
 
-def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """REINFORCE on any other environment, in SB3's loop; parameters and result as in rl_zoo3."""
-    return convert_reinforce(
+    return _convert_reinforce(
         {
-            **suggest_common(trial),
+            **_suggest_common(trial),
             "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.03, log=True),
             "n_steps_pow": trial.suggest_int("n_steps_pow", 6, 11),
             "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
@@ -117,12 +117,12 @@ def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_a
     )
 
 
-def convert_powers(params: Params) -> Params:
+def _convert_powers(params: _Params) -> _Params:
     """
     :param params: Parameters of a trial
     :return: Hyperparameters: ``x_pow`` is the binary logarithm of ``x``, ``one_minus_x`` is 1 - ``x``
     """
-    converted: Params = {}
+    converted: _Params = {}
     for name, value in params.items():
         if name.endswith("_pow"):
             converted[name.removesuffix("_pow")] = 2**value
@@ -133,22 +133,22 @@ def convert_powers(params: Params) -> Params:
     return converted
 
 
-def convert_reinforce(params: Params) -> Params:
+def _convert_reinforce(params: _Params) -> _Params:
     """
     :param params: Parameters of a REINFORCE trial
     :return: Hyperparameters; the YAML's baseline arguments are dropped, because they do not fit other baselines
     """
-    return {**convert_powers(params), "baseline_kwargs": None}
+    return {**_convert_powers(params), "baseline_kwargs": None}
 
 
-OUR_SPACES: dict[str, tuple[Sampler, Converter]] = {
-    "reinforce": (sample_reinforce, convert_reinforce),
-    "ppo": (sample_ppo, convert_powers),
-    "ppo_mask": (sample_ppo, convert_powers),
-    "a2c": (sample_a2c, convert_powers),
+OUR_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+    "reinforce": (_sample_reinforce, _convert_reinforce),
+    "ppo": (_sample_ppo, _convert_powers),
+    "ppo_mask": (_sample_ppo, _convert_powers),
+    "a2c": (_sample_a2c, _convert_powers),
 }
-OTHER_SPACES: dict[str, tuple[Sampler, Converter]] = {
-    "reinforce": (sample_reinforce_steps, convert_reinforce),
+OTHER_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+    "reinforce": (_sample_reinforce_steps, _convert_reinforce),
     "ppo": (sample_ppo_params, convert_onpolicy_params),
     "ppo_mask": (sample_ppo_params, convert_onpolicy_params),
     "a2c": (sample_a2c_params, convert_onpolicy_params),

@@ -31,7 +31,7 @@ FIGURE_AXES = {
 FIGURE_FILES = ("comparison.png", "comparison.pdf")
 CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
 PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
-GRID_POINTS = 200
+_GRID_POINTS = 200
 
 
 class Run(NamedTuple):
@@ -88,7 +88,7 @@ class TableRow(NamedTuple):
     difference: Estimate
 
 
-def by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def _by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """
     :param runs: Runs
     :return: The runs by variant, in order of appearance
@@ -135,7 +135,7 @@ def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
         values = values[:, None] if values.ndim == 1 else values
         return interpolate(getattr(run.history, axis), values, where)[0]
 
-    groups = by_variant(runs)
+    groups = _by_variant(runs)
     # (n_seeds, n_instances) each.
     greedy = {name: np.stack([of(run, "results") for run in group]) for name, group in groups.items()}
     best = max(greedy, key=lambda name: greedy[name].mean())
@@ -166,7 +166,7 @@ def compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Ban
     :return: Mean over seeds and its confidence interval
     """
     last = min(float(getattr(run.history, axis)[-1]) for run in group)
-    grid = np.linspace(0.0, min(last, end), GRID_POINTS)
+    grid = np.linspace(0.0, min(last, end), _GRID_POINTS)
     curves = []
     for run in group:
         means = getattr(run.history, field).mean(1)
@@ -182,7 +182,7 @@ def draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None
     :param n_samples: Samples per instance
     :param folder: Output folder of the figures
     """
-    groups = by_variant(runs)
+    groups = _by_variant(runs)
     fields = {"results": "greedy"}
     if n_samples > 0:
         fields["sampled"] = f"best of {n_samples} samples"
@@ -216,7 +216,7 @@ def csv_text(runs: Sequence[Run]) -> str:
     return text.getvalue()
 
 
-def markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
+def _markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
     """
     :param rows: Rows, the best first
     :param n_samples: Samples per instance
@@ -296,19 +296,19 @@ def write_results(
         "",
         f"## At equal environment steps: {budget:,}",
         "",
-        markdown_table(compute_table(runs, "timesteps", budget), n_samples),
+        _markdown_table(compute_table(runs, "timesteps", budget), n_samples),
         "",
         f"## At equal wall time: {wall:,.1f} s of training",
         "",
         "The time of the fastest run.",
         "",
-        markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
+        _markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
         "",
         f"## At equal CPU time: {cpu:,.1f} s of training",
         "",
         "Other processes on the machine lengthen wall time, by a different factor in each run; they hardly change CPU time.",
         "",
-        markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
+        _markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
         "",
         "## How to read this",
         "",

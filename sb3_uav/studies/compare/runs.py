@@ -118,7 +118,7 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
     waiting = list(trainings)
     running: list[tuple[ZooTraining, subprocess.Popen[bytes], float]] = []
     failures: list[str] = []
-    with termination_as_interrupt():
+    with _termination_as_interrupt():
         try:
             while waiting or running:
                 while waiting and len(running) < n_jobs:
@@ -141,7 +141,7 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
 
 
 @contextmanager
-def termination_as_interrupt() -> Iterator[None]:
+def _termination_as_interrupt() -> Iterator[None]:
     """Let SIGTERM raise KeyboardInterrupt, so that `finally` blocks are run."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

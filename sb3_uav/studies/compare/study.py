@@ -50,10 +50,10 @@ def run_study(settings: Settings, arguments: Sequence[str], report_only: bool = 
     if needs_router:
         make_router(settings, problem)
     check_settings(settings, needs_router)
-    trainings = plan_trainings([with_common_ground(variant, settings, needs_router) for variant in variants], settings)
+    trainings = _plan_trainings([with_common_ground(variant, settings, needs_router) for variant in variants], settings)
     if not report_only:
         train_all([training for training in trainings if not training.is_finished], settings.jobs)
-    return write_report(settings, arguments, [training for training in trainings if training.is_finished])
+    return _write_report(settings, arguments, [training for training in trainings if training.is_finished])
 
 
 def with_common_ground(variant: Variant, settings: Settings, needs_router: bool) -> Variant:
@@ -80,7 +80,7 @@ def with_common_ground(variant: Variant, settings: Settings, needs_router: bool)
     return variant._replace(entry={**variant.entry, "n_timesteps": settings.n_timesteps, "callback": callbacks})
 
 
-def plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooTraining]:
+def _plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooTraining]:
     """
     Write the YAML of every variant.
 
@@ -114,7 +114,7 @@ def plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooT
     return sorted(trainings, key=lambda training: settings.seeds.index(training.seed))
 
 
-def write_report(settings: Settings, arguments: Sequence[str], finished: Sequence[ZooTraining]) -> list[Path]:
+def _write_report(settings: Settings, arguments: Sequence[str], finished: Sequence[ZooTraining]) -> list[Path]:
     """
     :param settings: Settings of the comparison
     :param arguments: Arguments of the command, quoted in the report

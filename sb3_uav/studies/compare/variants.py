@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
-SHARED_SAMPLES = 8
+_SHARED_SAMPLES = 8
 # The paper tests on 10,000 instances after each epoch, which would take longer than small epochs themselves.
-ROLLOUT_TEST_INSTANCES = 1_000
+_ROLLOUT_TEST_INSTANCES = 1_000
 
 
 class Variant(NamedTuple):
@@ -33,7 +33,7 @@ class Variant(NamedTuple):
         return re.sub(r"[^A-Za-z0-9]+", "-", self.name).strip("-").lower()
 
 
-def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str, Any]:
+def _read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str, Any]:
     """
     :param algo: rl_zoo3's name of an algorithm
     :param env_id: Id of an environment
@@ -50,23 +50,23 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     return plain_numbers(entries[env_id])
 
 
-def default_variants(env_id: str) -> dict[str, dict[str, Any]]:
+def _default_variants(env_id: str) -> dict[str, dict[str, Any]]:
     """
     :param env_id: Id of an environment
     :return: PPO, MaskablePPO, and REINFORCE with two baselines, the latter with equally many episodes per update and per epoch
     """
-    entry = read_entry("reinforce", env_id)
+    entry = _read_entry("reinforce", env_id)
     n_samples = entry.get("n_samples", 1)
     episodes = entry["n_envs"] * n_samples
     if entry.get("baseline") != "shared":
-        n_samples = SHARED_SAMPLES
+        n_samples = _SHARED_SAMPLES
     shared = dict(algo="reinforce", baseline="shared", n_samples=n_samples, n_envs=max(episodes // n_samples, 1))
     rollout = dict(algo="reinforce", baseline="rollout", n_samples=1, n_envs=episodes)
     if "instances_per_epoch" in entry:
         epoch = entry["instances_per_epoch"] * entry.get("n_samples", 1)
         shared["instances_per_epoch"], rollout["instances_per_epoch"] = max(epoch // n_samples, 1), epoch
     baseline = entry["baseline_kwargs"] if entry.get("baseline") == "rollout" and "baseline_kwargs" in entry else {}
-    rollout["baseline_kwargs"] = {"n_test_instances": ROLLOUT_TEST_INSTANCES, **baseline}
+    rollout["baseline_kwargs"] = {"n_test_instances": _ROLLOUT_TEST_INSTANCES, **baseline}
     shared["baseline_kwargs"] = None
     return {
         "PPO": dict(algo="ppo"),
@@ -83,14 +83,14 @@ def read_variants(path: Path | None, env_id: str) -> list[Variant]:
     :return: The variants with their complete YAML entries
     :raises ValueError: If something is missing or not allowed; the message names it
     """
-    given = default_variants(env_id) if path is None else read_yaml(path)
+    given = _default_variants(env_id) if path is None else read_yaml(path)
     if not given or not all(isinstance(changes, dict) and isinstance(changes.get("algo"), str) for changes in given.values()):
         raise ValueError(f"--variants {path}: must be a mapping from names to mappings with at least the key 'algo'.")
     variants = []
     for name, changes in given.items():
         changes = plain_numbers(changes)
         algo = changes.pop("algo")
-        entry = {**read_entry(algo, env_id, changes.pop("conf_file", None)), **changes}
+        entry = {**_read_entry(algo, env_id, changes.pop("conf_file", None)), **changes}
         variants.append(Variant(str(name), algo, {key: value for key, value in entry.items() if value is not None}))
     folders = [variant.folder for variant in variants]
     if len(set(folders)) < len(folders) or "" in folders:
@@ -120,7 +120,7 @@ def router_settings(env_id: str) -> dict[str, Any]:
     :param env_id: Id of an allocation environment
     :return: Settings of the router in our REINFORCE entry; empty if the entry trains no router
     """
-    for callback in callbacks_of(read_entry("reinforce", env_id)):
+    for callback in callbacks_of(_read_entry("reinforce", env_id)):
         if callback_name(callback) == "ITSCallback" and isinstance(callback, dict):
             return dict(next(iter(callback.values()))["router"])
     return {}

@@ -13,11 +13,11 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.evaluation.set_evaluation import Progress
 from sb3_uav.evaluation.summary import SummaryRow
+from sb3_uav.reproduce.pairs import Model
+from sb3_uav.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
+from sb3_uav.reproduce.scales import Scale, Scenario
 from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.unavailable import UnavailableSolver
-from sb3_uav.studies.reproduce.pairs import Model
-from sb3_uav.studies.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
-from sb3_uav.studies.reproduce.scales import Scale, Scenario
 from sb3_uav.training.its_schedule import INDEPENDENT
 
 # The solvers that stand for the paper's baselines.

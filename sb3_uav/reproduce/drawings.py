@@ -14,10 +14,10 @@ from sb3_uav.evaluation.summary import gaps
 from sb3_uav.plots.figure_files import new_figure
 from sb3_uav.plots.schedule_map import MapPanel, schedules_figure
 from sb3_uav.plots.style import MARKERS, MAX_MARKERS, ORANGE, PURPLE, SERIES_COLORS, VERMILION, style_axes
-from sb3_uav.studies.reproduce.paper import SIZES
-from sb3_uav.studies.reproduce.table_formats import MISSING, Table
+from sb3_uav.reproduce.paper import SIZES
+from sb3_uav.reproduce.table_formats import MISSING, Table
 
-MAPS_PER_LINE = 3
+_MAPS_PER_LINE = 3
 DEPOT = "depot"
 UPPER_LEVEL, LOWER_LEVEL = "Upper level", "Lower level"
 SCHEDULE_COLUMNS = ("Situation", "Point", "x", "y", "Maximum distance", "UAV", "Stop")
@@ -36,7 +36,7 @@ class Curve(NamedTuple):
     n_pretraining: int
 
 
-def draw_schedules(table: Table) -> Any:
+def _draw_schedules(table: Table) -> Any:
     """
     Fig. 3.
 
@@ -61,10 +61,10 @@ def draw_schedules(table: Table) -> Any:
             routes.append([stops[stop] for stop in sorted(stops)])
         title = f"{situation}: {sum(map(len, routes))} of {len(tasks)} tasks"
         panels.append(MapPanel(instances, 0, Schedule(routes), title))
-    return schedules_figure(panels, MAPS_PER_LINE)
+    return schedules_figure(panels, _MAPS_PER_LINE)
 
 
-def read_curves(table: Table) -> dict[str, dict[str, Curve]]:
+def _read_curves(table: Table) -> dict[str, dict[str, Curve]]:
     """
     :param table: A row for each epoch of each level
     :return: The curves by training and level
@@ -78,14 +78,14 @@ def read_curves(table: Table) -> dict[str, dict[str, Curve]]:
     return curves
 
 
-def draw_learning_curves(table: Table) -> Any:
+def _draw_learning_curves(table: Table) -> Any:
     """
     Fig. 4.
 
     :param table: A row for each epoch of each level; the trainings are named after their scenarios
     :return: A matplotlib figure
     """
-    curves = read_curves(table)
+    curves = _read_curves(table)
     fleets = sorted({name.partition("-")[0] for name in curves})
     figure = new_figure(5.5 * len(fleets), 7.0)
     colors = dict(zip(map(str, SIZES), _shades(len(SIZES)), strict=True))
@@ -106,7 +106,7 @@ def draw_learning_curves(table: Table) -> Any:
     return figure
 
 
-def draw_ablation(table: Table) -> Any:
+def _draw_ablation(table: Table) -> Any:
     """
     Fig. 5.
 
@@ -117,7 +117,7 @@ def draw_ablation(table: Table) -> Any:
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "by epoch", "epoch of the upper level", "cost")
     style_axes(right, "by training time", "minutes", "")
-    for position, (strategy, levels) in enumerate(read_curves(table).items()):
+    for position, (strategy, levels) in enumerate(_read_curves(table).items()):
         curve = levels[UPPER_LEVEL]
         look = {
             "color": SERIES_COLORS[position],
@@ -133,7 +133,7 @@ def draw_ablation(table: Table) -> Any:
     return figure
 
 
-def draw_generalization(table: Table) -> Any:
+def _draw_generalization(table: Table) -> Any:
     """
     Figs. 6 and 7.
 
@@ -174,9 +174,9 @@ def _markers(n_points: int, position: int) -> dict[str, Any]:
 
 # What each figure is drawn from (the stem of its CSV) and how.
 DRAWINGS: Mapping[str, tuple[str, Callable[[Table], Any]]] = {
-    "fig3": ("fig3_schedules", draw_schedules),
-    "fig4": ("fig4_curves", draw_learning_curves),
-    "fig5": ("fig5_curves", draw_ablation),
-    "fig6": ("fig6", draw_generalization),
-    "fig7": ("fig7", draw_generalization),
+    "fig3": ("fig3_schedules", _draw_schedules),
+    "fig4": ("fig4_curves", _draw_learning_curves),
+    "fig5": ("fig5_curves", _draw_ablation),
+    "fig6": ("fig6", _draw_generalization),
+    "fig7": ("fig7", _draw_generalization),
 }

@@ -17,12 +17,12 @@ import yaml
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
-from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
 TRAINING_FILE = "training.json"
-CONFIG_FILE, OUTPUT_FILE = "config.yml", "output.txt"
+_CONFIG_FILE, _OUTPUT_FILE = "config.yml", "output.txt"
 ITS_KEY = "sb3_uav.training.ITSCallback"
 
 
@@ -123,7 +123,7 @@ def train_pair(job: PairTraining) -> None:
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
 
     job.run_folder.mkdir(parents=True, exist_ok=True)
-    config = job.run_folder / CONFIG_FILE
+    config = job.run_folder / _CONFIG_FILE
     text = yaml.safe_dump({job.env_id: job.entry}, sort_keys=False)
     run = job.newest_run()
     if run is not None and config.is_file() and config.read_text(encoding="utf-8") != text:
@@ -158,7 +158,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     if interrupted is not None:
         checkpoint = interrupted / CHECKPOINT_FOLDER
         arguments += ["--trained-agent", str(checkpoint / read_state(checkpoint)["allocator"])]
-    output = job.run_folder / OUTPUT_FILE
+    output = job.run_folder / _OUTPUT_FILE
     with output.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
         code = zoo_train.main(arguments)
     if code != 0:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_uav.studies.reproduce.evaluator import BASELINES, Evaluator
-from sb3_uav.studies.reproduce.origin import Origin
-from sb3_uav.studies.reproduce.output_files import write_files
-from sb3_uav.studies.reproduce.pairs import Models
-from sb3_uav.studies.reproduce.scales import Scale, Scenario
-from sb3_uav.studies.reproduce.table_formats import Table
+from sb3_uav.reproduce.evaluator import BASELINES, Evaluator
+from sb3_uav.reproduce.origin import Origin
+from sb3_uav.reproduce.output_files import write_files
+from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.scales import Scale, Scenario
+from sb3_uav.reproduce.table_formats import Table
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
 from typing import NamedTuple
 
-from sb3_uav.studies.reproduce.epoch_lines import EpochLines
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair
+from sb3_uav.reproduce.epoch_lines import EpochLines
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair
 
 
 def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:

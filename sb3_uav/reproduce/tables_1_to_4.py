@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.evaluation.summary import SummaryRow, gaps
-from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.evaluator import BASELINES, complete
-from sb3_uav.studies.reproduce.pairs import Model, read_log
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.evaluator import BASELINES, complete
+from sb3_uav.reproduce.pairs import Model, read_log
+from sb3_uav.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
     FULL_BLOCK,
@@ -31,13 +30,14 @@ from sb3_uav.studies.reproduce.paper import (
     paper_figure,
     paper_tables,
 )
-from sb3_uav.studies.reproduce.scales import Scenario, scenarios
-from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import Column, Table, number
+from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.session import Notes, Session
+from sb3_uav.reproduce.table_formats import Column, Table, number
+from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 PAPER, OURS = "paper", "ours"
-FASTEST_SHOWN = 0.1
+_FASTEST_SHOWN = 0.1
 
 
 class PhaseTimes(NamedTuple):
@@ -61,7 +61,7 @@ def seconds(value: float | None) -> str:
     :param value: A time
     :return: Text for a cell, with more digits for short times
     """
-    return number(value, 2 if value is None or math.isnan(value) or value >= FASTEST_SHOWN else 4)
+    return number(value, 2 if value is None or math.isnan(value) or value >= _FASTEST_SHOWN else 4)
 
 
 # ---------------------------------------------------------------------------------------------------------------- Table I

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_uav.studies.reproduce.pair_training import (
+from sb3_uav.reproduce.pair_training import (
     ALLOCATOR_FILE,
     ITS_LOG,
     ROUTER_FILE,
@@ -15,8 +15,8 @@ from sb3_uav.studies.reproduce.pair_training import (
     check_complete,
     training_entry,
 )
-from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
-from sb3_uav.studies.reproduce.training_processes import train_pairs
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.reproduce.training_processes import train_pairs
 from sb3_uav.training.its_schedule import ALTERNATE_ONLY, INDEPENDENT, ITS, NO_INTENSIVE, NO_PRETRAINING
 
 LEVELS = ("allocator", "router")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_uav.studies.reproduce.paper import FLEETS, LARGER_SIZES, MAX_DISTANCE, SIZES
+from sb3_uav.reproduce.paper import FLEETS, LARGER_SIZES, MAX_DISTANCE, SIZES
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Any
 
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.plots.figure_files import save_figure
-from sb3_uav.studies.reproduce.drawings import DRAWINGS
-from sb3_uav.studies.reproduce.origin import Origin
-from sb3_uav.studies.reproduce.table_formats import Table, read_csv, to_csv, to_latex, to_markdown
-from sb3_uav.studies.reproduce.table_layout import lay_out
+from sb3_uav.reproduce.drawings import DRAWINGS
+from sb3_uav.reproduce.origin import Origin
+from sb3_uav.reproduce.table_formats import Table, read_csv, to_csv, to_latex, to_markdown
+from sb3_uav.reproduce.table_layout import lay_out
 
-TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
-FIGURE_SUFFIXES = (".png", ".pdf")
+_TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
+_FIGURE_SUFFIXES = (".png", ".pdf")
 
 
 def write_files(table: Table, origin: Origin, folder: Path, name: str, drawn: Table | None = None) -> list[Path]:
@@ -30,7 +30,7 @@ def write_files(table: Table, origin: Origin, folder: Path, name: str, drawn: Ta
     :raises ValueError: If they cannot be written
     """
     lay_out(table)
-    paths = [_write_text(folder / f"{name}{suffix}", write(table, origin.lines)) for suffix, write in TABLE_FORMATS.items()]
+    paths = [_write_text(folder / f"{name}{suffix}", write(table, origin.lines)) for suffix, write in _TABLE_FORMATS.items()]
     if drawn is None:
         return paths
     stem, draw = DRAWINGS[name]
@@ -80,7 +80,7 @@ def _write_text(path: Path, text: str) -> Path:
 
 def _write_figure(figure: Any, origin: Origin, stem: Path) -> list[Path]:
     figure.supxlabel(origin.footer(), fontsize=7, color="0.45", x=0.995, ha="right")
-    paths = [stem.with_name(stem.name + suffix) for suffix in FIGURE_SUFFIXES]
+    paths = [stem.with_name(stem.name + suffix) for suffix in _FIGURE_SUFFIXES]
     for path in paths:
         save_figure(figure, path, origin.metadata(path.suffix))
     return paths

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.session import Session
 
 TARGETS = ("table1", "table2", "table3", "table4", "fig3", "fig4", "fig5", "fig6", "fig7")
 DEFAULT_SOLVERS = ("milp", "ortools", "kmeans-vnd", "kmeans-am")
@@ -15,7 +15,7 @@ DEFAULT_SOLVERS = ("milp", "ortools", "kmeans-vnd", "kmeans-am")
 
 def target_functions() -> dict[str, Callable[[Session], list[Path]]]:
     """:return: The functions that make the tables and figures, by name"""
-    from sb3_uav.studies.reproduce import figures_3_to_7, tables_1_to_4
+    from sb3_uav.reproduce import figures_3_to_7, tables_1_to_4
 
     modules = (tables_1_to_4, figures_3_to_7)
     return {name: getattr(modules[0] if name.startswith("table") else modules[1], name) for name in TARGETS}

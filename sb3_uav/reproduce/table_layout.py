@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 
-from sb3_uav.studies.reproduce.table_formats import MISSING, Table
+from sb3_uav.reproduce.table_formats import MISSING, Table
 
 
 def best(cells: Sequence[str], smallest: bool = False) -> list[int]:

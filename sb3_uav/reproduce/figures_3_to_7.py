@@ -10,11 +10,10 @@ import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule, check_schedule
-from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
-from sb3_uav.studies.reproduce.evaluator import complete
-from sb3_uav.studies.reproduce.pairs import LEVELS, Model, read_log
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
+from sb3_uav.reproduce.evaluator import complete
+from sb3_uav.reproduce.pairs import LEVELS, Model, read_log
+from sb3_uav.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
     ABLATION_STRATEGIES,
@@ -24,13 +23,14 @@ from sb3_uav.studies.reproduce.paper import (
     SIZES,
     STRATEGY_TITLES,
 )
-from sb3_uav.studies.reproduce.scales import Scenario, scenarios
-from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, number
-from sb3_uav.studies.reproduce.tables_1_to_4 import trained_pairs
+from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.session import Notes, Session
+from sb3_uav.reproduce.table_formats import MISSING, Column, Table, number
+from sb3_uav.reproduce.tables_1_to_4 import trained_pairs
+from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
-LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
+_LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
 
 
 class LoggedCurve(NamedTuple):
@@ -94,12 +94,12 @@ def fig3(session: Session) -> list[Path]:
         n_tasks, counts = int(instances.task_mask.sum()), [len(route) for route in result.schedule.routes]
         cells = [scenario.name, str(n_tasks), str(sum(counts)), number(sum(report.lengths)), " ".join(map(str, counts))]
         table.add(cells)
-        add_points(points, scenario.name, instances, result.schedule)
+        _add_points(points, scenario.name, instances, result.schedule)
     table.notes = points.notes = notes.list()
     return session.write(table, "fig3", points)
 
 
-def add_points(points: Table, name: str, instances: Instances, schedule: Schedule) -> None:
+def _add_points(points: Table, name: str, instances: Instances, schedule: Schedule) -> None:
     """
     :param points: The table that receives a row for the depot and for each task
     :param name: Name of the situation
@@ -143,7 +143,7 @@ def fig4(session: Session) -> list[Path]:
         for level, curve in levels.items():
             if len(curve.cost) > 0:
                 costs = (curve.cost[0], curve.cost.min(), curve.cost[-1])
-                table.add([scenario.name, LEVEL_TITLES[level], str(len(curve.cost)), *(number(float(c)) for c in costs)])
+                table.add([scenario.name, _LEVEL_TITLES[level], str(len(curve.cost)), *(number(float(c)) for c in costs)])
     table.notes = notes.list()
     return session.write(table, "fig4", _curves_table("Fig. 4", {s.name: c for s, c in curves.items()}, table.notes))
 
@@ -154,7 +154,7 @@ def _curves_table(label: str, curves: Mapping[str, Mapping[str, LoggedCurve]], n
         for level, curve in levels.items():
             for index, phase in enumerate(curve.phase):
                 figures = f"{curve.cost[index]:.4f}", f"{curve.minutes[index]:.4f}"
-                table.add([name, LEVEL_TITLES[level], str(index + 1), phase, *figures])
+                table.add([name, _LEVEL_TITLES[level], str(index + 1), phase, *figures])
     return table
 
 

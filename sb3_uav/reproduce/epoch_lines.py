@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 from types import TracebackType
 
-from sb3_uav.studies.reproduce.pair_training import PairTraining
+from sb3_uav.reproduce.pair_training import PairTraining
 
 # Seconds between two reads of the logs of running trainings.
 POLL_INTERVAL = 1.0

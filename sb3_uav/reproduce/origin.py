@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sb3_uav.evaluation.provenance import describe_machine
-from sb3_uav.studies.reproduce.paper import paper_tables
-from sb3_uav.studies.reproduce.scales import Scale
+from sb3_uav.reproduce.paper import paper_tables
+from sb3_uav.reproduce.scales import Scale
 
 KEYS = ("Command", "Scale", "Seed", "Versions", "Machine", "Figures of the paper")
 

@@ -11,7 +11,7 @@ from itertools import groupby, takewhile
 from pathlib import Path
 
 MISSING = "-"
-LATEX_SPECIAL = str.maketrans(
+_LATEX_SPECIAL = str.maketrans(
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
 )
@@ -109,29 +109,29 @@ def to_latex(table: Table, about: Sequence[str]) -> str:
     """
 
     def cell(position: int, column: int, text: str) -> str:
-        escaped = text.translate(LATEX_SPECIAL)
+        escaped = text.translate(_LATEX_SPECIAL)
         return rf"\textbf{{{escaped}}}" if (position, column) in table.bold and text else escaped
 
     text = [f"% {item}" for item in about]
     text += ["% Needs \\usepackage{booktabs,graphicx}", "\\begin{table*}[htbp]", "\\centering"]
     # LaTeX numbers the table itself.
-    text += [rf"\caption{{{table.caption.translate(LATEX_SPECIAL)}}}", "\\resizebox{\\textwidth}{!}{%"]
+    text += [rf"\caption{{{table.caption.translate(_LATEX_SPECIAL)}}}", "\\resizebox{\\textwidth}{!}{%"]
     text += [rf"\begin{{tabular}}{{{''.join('r' if numeric else 'l' for numeric in _numeric(table))}}}", "\\toprule"]
     if any(column.group for column in table.columns):
         cells, rules, first = [], [], 1
         for group, columns in groupby(table.columns, key=lambda column: column.group):
             width = len(list(columns))
-            cells.append(rf"\multicolumn{{{width}}}{{c}}{{{group.translate(LATEX_SPECIAL)}}}")
+            cells.append(rf"\multicolumn{{{width}}}{{c}}{{{group.translate(_LATEX_SPECIAL)}}}")
             rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}" if group else "")
             first += width
         text += [" & ".join(cells) + r" \\", "".join(rules)]
-    text += [" & ".join(column.title.translate(LATEX_SPECIAL) for column in table.columns) + r" \\", "\\midrule"]
+    text += [" & ".join(column.title.translate(_LATEX_SPECIAL) for column in table.columns) + r" \\", "\\midrule"]
     for position, row in enumerate(table.rows):
         if position > 0 and position in table.rules:
             text.append("\\midrule")
         text.append(" & ".join(cell(position, column, content) for column, content in enumerate(row)) + r" \\")
     text += ["\\bottomrule", "\\end{tabular}}"]
-    text += [rf"\par\footnotesize {note.translate(LATEX_SPECIAL)}" for note in table.notes]
+    text += [rf"\par\footnotesize {note.translate(_LATEX_SPECIAL)}" for note in table.notes]
     return "\n".join([*text, "\\end{table*}"]) + "\n"
 
 
