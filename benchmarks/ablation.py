@@ -1,5 +1,5 @@
 """
-What each ingredient of the default preset is worth: the same short training without it.
+The effect of each ingredient of the default preset: the same short training without it.
 
 Every variant trains an allocator and a router in turn (the ITS without its first two phases) from scratch, on one scenario and
 on equally many sampled solutions, and is evaluated on the same test instances, greedily and with 32 samples. One run each is a
@@ -8,7 +8,7 @@ rough measure; more seeds make it better.
     python benchmarks/ablation.py --out ablation.csv
     python benchmarks/ablation.py --out ablation.csv --seeds 1 2 --variants default "no sweep"
 
-A call that was interrupted goes on where it stopped.
+Rerun an interrupted call to resume it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sb3_uav.training import ITSCallback
 
 LEARNING: dict[str, Any] = dict(n_samples=8, baseline="shared", normalize_advantage=True, max_grad_norm=1.0, lr_decay=0.9)
 NETWORK: dict[str, Any] = dict(use_values=False, mixed_precision=True)
-# What is changed, of the networks and of the algorithms, in both levels.
+# Changes to the networks and to the algorithms, on both levels.
 VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "default": ({}, {}),
     "no sweep": ({"sweep": False}, {}),
@@ -43,19 +43,19 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "paper's networks": ({"preset": "paper", "normalization": "instance"}, {}),
 }
 COLUMNS = ("variant", "seed", "greedy", "sampling_32", "seconds", "n_parameters")
-# Switches that only one of the levels has.
+# Settings that only one of the levels has.
 OF_THE_ALLOCATOR = {"sweep", "shared_scorer"}
 
 
 def train(name: str, seed: int, args: argparse.Namespace) -> tuple[DLDRL, float]:
     """
-    :param name: Of the variant
-    :param seed: Of its training
-    :param args: Of the command
-    :return: The trained pair, and how many seconds it took
+    :param name: Name of the variant
+    :param seed: Seed of its training
+    :param args: Arguments of the command
+    :return: The trained pair, and the duration in seconds
     """
     network, learning = VARIANTS[name]
-    # As many solutions, whatever the number of samples of an instance.
+    # Equally many solutions for any number of samples per instance.
     factor = LEARNING["n_samples"] // learning.get("n_samples", LEARNING["n_samples"])
     env = BatchedVecEnv([lambda: TaskAllocationEnv(args.n_tasks, args.n_uavs)] * (factor * args.n_envs))
     of_the_router = {key: value for key, value in network.items() if key not in OF_THE_ALLOCATOR}
@@ -98,12 +98,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--n-tasks", type=int, default=80)
     parser.add_argument("--n-uavs", type=int, default=4)
-    parser.add_argument(
-        "--n-envs", type=int, default=16, help="instances of an update of the allocator (default: %(default)s)"
-    )
+    parser.add_argument("--n-envs", type=int, default=16, help="allocator instances per update (default: %(default)s)")
     parser.add_argument("--n-epochs", type=int, default=10)
-    parser.add_argument("--instances", type=int, default=240, help="of an epoch of the allocator (default: %(default)s)")
-    parser.add_argument("--router-instances", type=int, default=1600, help="of an epoch of the router (default: %(default)s)")
+    parser.add_argument("--instances", type=int, default=240, help="allocator instances per epoch (default: %(default)s)")
+    parser.add_argument("--router-instances", type=int, default=1600, help="router instances per epoch (default: %(default)s)")
     parser.add_argument("--n-test-instances", type=int, default=64)
     parser.add_argument("--num-threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="CSV file")

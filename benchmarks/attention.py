@@ -1,5 +1,5 @@
 """
-The encoder's attention (torch's fused kernel) against the same products written out, and against the kernel in bfloat16,
+The encoder's attention (torch's fused kernel) against explicit matrix products, and against the kernel in bfloat16,
 forward and backward.
 
     python benchmarks/attention.py
@@ -16,7 +16,7 @@ from sb3_uav.policies.encoder import attend
 
 
 def written_out(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, bias: th.Tensor | None) -> th.Tensor:
-    """The same as matrix products and a softmax."""
+    """Attention as matrix products and a softmax."""
     query, key, value = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
     scores = (query / math.sqrt(query.shape[-1])) @ key.transpose(2, 3)
     scores = scores if bias is None else scores + bias
@@ -24,14 +24,14 @@ def written_out(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int
 
 
 def in_bfloat16(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, bias: th.Tensor | None) -> th.Tensor:
-    """The kernel as autocast would call it."""
+    """The kernel in bfloat16, as under autocast."""
     query, key, value = (part.bfloat16().unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
     mask = None if bias is None else bias.bfloat16()
     return th.nn.functional.scaled_dot_product_attention(query, key, value, attn_mask=mask).transpose(1, 2).flatten(2)
 
 
 def seconds(attention: Any, inputs: list[th.Tensor], n_heads: int, bias: th.Tensor | None, repeats: int) -> float:
-    """:return: Seconds of one forward and backward pass, the best of several"""
+    """:return: Seconds of one forward and backward pass, best of several"""
     best = float("inf")
     for _ in range(repeats):
         start = time.perf_counter()

@@ -1,10 +1,10 @@
 """
-Ours beside the paper's, cell by cell of its Tables II to IV.
+Our results beside the paper's, for each cell of its Tables II to IV.
 
 Reads folders of ``sb3-uav evaluate`` in which ``ortools`` and other solvers solved the same instances, and prints a Markdown
 table: for every scenario the mean objective of ``ortools``, the ratio of DL-DRL (Sampling) to OR-Tools in the paper, and the
 ratio of each solver's mean to that of ``ortools`` on the instances that both solved. The paper's instances are not public;
-ratios on instances of the same distribution are what can be compared.
+only ratios on instances of the same distribution are comparable.
 
     python benchmarks/better_than_the_paper.py RESULTS [RESULTS ...] --solvers "dl-drl:decode=sampling" "pyvrp:time_limit=1"
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_uav.common.statistics import confidence_halfwidth
-from sb3_uav.studies.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
+from sb3_uav.reproduce.paper import FULL_BLOCK, OR_TOOLS, SAMPLING, SIZES, paper_figure
 
 REFERENCE = "ortools"
 
@@ -31,14 +31,14 @@ Objectives = Mapping[tuple[int, int], Mapping[str, Mapping[tuple[str, int], floa
 def read(folders: Sequence[Path]) -> Objectives:
     """
     :param folders: Folders of ``sb3-uav evaluate``
-    :return: What the solvers found, by scenario, solver, and file and place of the instance
+    :return: Objectives by scenario, solver, and file and index of the instance
     :raises ValueError: If a solver failed, or solved an instance twice
     """
     found: dict[tuple[int, int], dict[str, dict[tuple[str, int], float]]] = defaultdict(lambda: defaultdict(dict))
     for folder in folders:
         with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        # Instances are counted through all files, of which every scenario has one.
+        # Instances are numbered across all files, one per scenario.
         first = {row["source"]: min(int(r["instance"]) for r in rows if r["source"] == row["source"]) for row in rows}
         for row in rows:
             if row["status"] != "ok" or row["feasible"] != "True":
@@ -66,7 +66,7 @@ def paper_ratio(n_uavs: int, n_tasks: int) -> float | None:
 def ratio(ours: Mapping[tuple[str, int], float], reference: Mapping[tuple[str, int], float]) -> tuple[float, float, int]:
     """
     :param ours: Objectives by instance
-    :param reference: The same of the reference
+    :param reference: Objectives of the reference by instance
     :return: Ratio of the means on the instances that both solved; half the width of its paired confidence interval, which is
         that of the mean difference in units of the reference's mean; and how many instances these are
     """
@@ -81,7 +81,7 @@ def ratio(ours: Mapping[tuple[str, int], float], reference: Mapping[tuple[str, i
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="folders of sb3-uav evaluate")
-    parser.add_argument("--solvers", nargs="+", help="which, in this order (default: all)")
+    parser.add_argument("--solvers", nargs="+", help="solvers to show, in this order (default: all)")
     parser.add_argument("--reference", default=REFERENCE, help="default: %(default)s")
     args = parser.parse_args()
     found = read(args.results)

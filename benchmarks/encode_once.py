@@ -1,5 +1,5 @@
 """
-What encoding an instance once per episode saves, against encoding it at every step.
+Time saved by encoding an instance once per episode instead of at every step.
 
 Collection: SB3's step loop (``policy(obs)`` in evaluation mode, ``BatchedVecEnv``) with and without the policy's cache.
 Training: one forward and backward pass over all transitions of some episodes, as whole episodes (encoded once each) and as
@@ -23,7 +23,7 @@ def collect(policy: AllocatorPolicy, env: BatchedVecEnv, use_cache: bool) -> tup
     """
     Play one episode in every row.
 
-    :return: Seconds in the network, seconds in all
+    :return: Seconds in the network, total seconds
     """
     policy.set_training_mode(True)
     policy.set_training_mode(False)
@@ -52,7 +52,7 @@ def train_by_episode(policy: AllocatorPolicy, instances: Instances, actions: th.
 
 
 def train_by_step(policy: AllocatorPolicy, instances: Instances, actions: th.Tensor) -> float:
-    """:return: Seconds of the same pass over single transitions, in minibatches of as many as there are episodes"""
+    """:return: Seconds of the same pass over single transitions, in minibatches of ``n_episodes``"""
     env = BatchedVecEnv([lambda: TaskAllocationEnv(instances.n_tasks, instances.n_uavs)] * len(instances))
     env.set_options([{"instance": instances[row]} for row in range(len(instances))])
     observation = env.reset()

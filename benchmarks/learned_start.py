@@ -1,7 +1,7 @@
 """
-What a learned start adds to a search: the same polish for the same time, from cheapest insertion and from the shipped pair.
+The benefit of a learned start for a search: the same polish in the same time from insertion and from the shipped pair.
 
-The time of the pair includes that of its networks and of the repair; cheapest insertion is given its time for nothing.
+The time of the pair includes its networks and the repair; the time of cheapest insertion is not counted.
 
     python benchmarks/learned_start.py U4-N500.npz U6-N500.npz --seconds 1 --n-instances 4
 """
@@ -22,8 +22,10 @@ from sb3_uav.solvers.postprocess import polish
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("instances", type=Path, nargs="+", help=".npz files")
-    parser.add_argument("--seconds", type=float, default=1.0, help="per instance (default: %(default)s)")
-    parser.add_argument("--n-instances", type=int, default=4, help="the first so many of each file (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=1.0, help="seconds per instance (default: %(default)s)")
+    parser.add_argument(
+        "--n-instances", type=int, default=4, help="number of leading instances of each file (default: %(default)s)"
+    )
     parser.add_argument("--num-threads", type=int, default=1)
     args = parser.parse_args()
     th.set_num_threads(args.num_threads)

@@ -1,11 +1,11 @@
 """
-What encoding an instance once per episode is worth to PPO: environment steps per second of whole collect and train cycles.
+PPO with instances encoded once per episode: environment steps per second of whole collect and train cycles.
 
 ``every step`` is what SB3 does with any extractor: ``DummyVecEnv``, ``DictRolloutBuffer``, an encoding for every step, in
 collection and in training. ``once`` is ``BatchedVecEnv``, ``EpisodeRolloutBuffer`` and the policy's cache. The algorithm, the
-network and all settings are the same; so are the environment steps. Every measurement has a process of its own, whose peak
-memory is that above what it took before the algorithm was made. An episode of the allocator has N steps; one of the router has
-as many as it visits tasks, few before any training, and the ratio cannot be more than that.
+network and all settings are the same; so are the environment steps. Every measurement runs in a separate process; its
+peak memory is counted from before the algorithm was created. An episode of the allocator has N steps; one of the router has
+one per visited task, few in an untrained network, which bounds the ratio.
 
     python benchmarks/ppo_throughput.py --n-tasks 20 80 200
 """
@@ -30,7 +30,7 @@ N_UAVS = 4
 class Measurement(NamedTuple):
     """
     :param steps_per_second: Environment steps per second of collecting and training
-    :param peak_memory: MiB above the start
+    :param peak_memory: Peak memory in MiB, above that at the start
     """
 
     steps_per_second: float
@@ -42,8 +42,8 @@ def measure(level: str, n_tasks: int, once: bool, args: argparse.Namespace) -> M
     :param level: ``"allocator"`` or ``"router"``
     :param n_tasks: Size of the instances
     :param once: Whether to encode every instance once per episode
-    :param args: Of the command line
-    :return: What the cycles took
+    :param args: Arguments of the command line
+    :return: Speed and memory of the cycles
     """
     th.set_num_threads(args.num_threads)
 
@@ -68,7 +68,7 @@ def measure(level: str, n_tasks: int, once: bool, args: argparse.Namespace) -> M
     extractor: Any = model.policy.features_extractor
     extractor.use_cache = extractor.share_encodings = once
     if once:
-        # The slow side needs no warming up: its cycle is long enough.
+        # The slow side needs no warm-up: its cycle is long enough.
         model.learn(n_steps * args.n_envs)
     start = time.perf_counter()
     model.learn(n_steps * args.n_envs * (args.n_cycles if once else 1))

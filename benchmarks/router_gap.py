@@ -1,5 +1,5 @@
 """
-How much of what local search finds in the same subsets a router's greedy tours collect, and how long a greedy schedule takes.
+The share of local search's tasks that a router's greedy tours collect in the same subsets, and the time of a greedy schedule.
 
 The subsets are those of the shipped allocator, greedily decoded.
 
@@ -32,7 +32,7 @@ def report_gaps(paths: list[Path], routers: list[Path], n_instances: int) -> Non
     """
     :param paths: ``.npz`` files
     :param routers: Zips
-    :param n_instances: How many of each file
+    :param n_instances: Number of leading instances of each file
     """
     allocator = load_policy(files()[0], "cpu", AllocatorPolicy)
     policies = [load_policy(router, "cpu", RouterPolicy) for router in routers or [files()[1]]]
@@ -61,7 +61,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("instances", type=Path, nargs="*", help=".npz files")
     parser.add_argument("--routers", type=Path, nargs="+", default=[], help="zips (default: the shipped one)")
-    parser.add_argument("--n-instances", type=int, default=16, help="the first so many of each file (default: %(default)s)")
+    parser.add_argument(
+        "--n-instances", type=int, default=16, help="number of leading instances of each file (default: %(default)s)"
+    )
     parser.add_argument("--solve-time", type=int, nargs="+", default=[], metavar="N_TASKS")
     parser.add_argument("--num-threads", type=int, default=1)
     args = parser.parse_args()

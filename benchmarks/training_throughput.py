@@ -1,8 +1,8 @@
 """
-How fast both levels train: instances and episodes per second of an epoch, against the paper's way and against RL4CO.
+Training speed of both levels: instances and episodes per second of an epoch, against the paper's method and RL4CO.
 
 An instance is one problem that contributes to one update; an episode is one sampled solution of it that enters the gradient.
-Greedy rollouts of a baseline are work but no episodes. Our shipped settings sample 8 episodes of every instance from one
+Greedy rollouts of a baseline do not count as episodes. Our shipped settings sample 8 episodes of every instance from one
 encoding, the others one, so both rates and both ratios are printed.
 
 ``default``
@@ -51,30 +51,25 @@ import csv
 import inspect
 import io
 import json
-import logging
-import os
 import subprocess
-import sys
-import time
-import warnings
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch as th
+from _rl4co_server import Clock, Measurement
 
 if TYPE_CHECKING:
     from sb3_uav.envs.routing import Router
     from sb3_uav.policies import RouterPolicy
 
-# sb3_uav is imported where it is needed: this file also runs in RL4CO's environment, which need not have it.
-
+SERVER = Path(__file__).resolve().with_name("_rl4co_server.py")
 CONFIG = Path(__file__).parents[1] / "zoo_configs" / "reinforce.yml"
 # Entries of the configuration.
 ENTRIES = {"default": "TaskAllocation-Universal-v0", "paper": "paper-U4"}
 SHAPE = ("embed_dim", "n_layers", "n_heads", "ff_dim", "normalization")
-# Who is compared with whom, by level.
+# Compared competitors, by level.
 PAIRS = {
     "allocator": [("default", "paper")],
     "router": [
@@ -87,43 +82,18 @@ PAIRS = {
 }
 
 
-class Measurement(NamedTuple):
-    """
-    :param n_instances: Instances learned from
-    :param seconds: How long it took
-    :param cpu_seconds: CPU time of all threads
-    :param mean_return: Mean return of the last episodes
-    """
-
-    n_instances: int
-    seconds: float
-    cpu_seconds: float
-    mean_return: float
-
-
 class Competitor(Protocol):
-    """Something that learns."""
+    """A training that can be measured."""
 
     # Episodes per instance.
     n_samples: int
 
     def measure(self, seconds: float) -> Measurement:
         """
-        :param seconds: How long to learn at least, in whole epochs
-        :return: What was done
+        :param seconds: Minimum duration; whole epochs are trained
+        :return: The measurement
         """
         ...
-
-
-class Clock:
-    """Time since it was started."""
-
-    def __init__(self) -> None:
-        self.start, self.cpu_start = time.perf_counter(), time.process_time()
-
-    def read(self) -> tuple[float, float]:
-        """:return: Seconds, CPU seconds"""
-        return time.perf_counter() - self.start, time.process_time() - self.cpu_start
 
 
 # -------------------------------------------------------------------------------------------------------------- ours
@@ -171,7 +141,7 @@ def router_shape(name: str) -> dict[str, Any]:
 def padded_plan(router: RouterPolicy) -> Router:
     """
     :param router: A router
-    :return: What plans with it as the paper does: all subsets at once, as large as the largest of them
+    :return: A planner as in the paper: all subsets at once, padded to the largest
     """
     return lambda subsets: router.decode_episodes(subsets)[:, 0]
 
@@ -182,7 +152,7 @@ class Ours:
 
     :param level: ``"allocator"`` or ``"router"``
     :param name: ``"default"``, ``"paper"`` or ``"plain"``
-    :param args: Of the command line
+    :param args: Arguments of the command line
     """
 
     def __init__(self, level: str, name: str, args: argparse.Namespace) -> None:
@@ -229,8 +199,8 @@ class RL4CO:
     RL4CO's attention model, in a process of its own.
 
     :param shape: Layers, width, heads and normalization
-    :param args: Of the command line
-    :raises RuntimeError: If the process ends before it is asked to
+    :param args: Arguments of the command line
+    :raises RuntimeError: If the process ends early
     """
 
     n_samples = 1
@@ -238,9 +208,9 @@ class RL4CO:
     def __init__(self, shape: dict[str, Any], args: argparse.Namespace) -> None:
         keys = ("n_tasks", "max_distance", "batch_size", "epoch_batches", "num_threads")
         settings = {key: getattr(args, key) for key in keys}
-        command = [args.rl4co, str(Path(__file__).resolve()), "--serve", json.dumps({**settings, **shape})]
+        command = [args.rl4co, str(SERVER), json.dumps({**settings, **shape})]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        # Its first epoch, without rollouts, is over when it says so.
+        # It reports the end of its first epoch, which has no rollouts.
         self._receive()
 
     def _receive(self) -> Any:
@@ -259,105 +229,6 @@ class RL4CO:
         """End the process."""
         self.process.kill()
         self.process.communicate()
-
-
-def serve(n_tasks: int, max_distance: float, batch_size: int, epoch_batches: int, num_threads: int, **shape: Any) -> None:
-    """
-    Train in RL4CO's environment: for every number of seconds on the standard input, a measurement on the standard output.
-
-    :param n_tasks: Number of tasks
-    :param max_distance: Maximum flight distance
-    :param batch_size: Instances per update
-    :param epoch_batches: Updates per epoch
-    :param num_threads: Threads of torch
-    :param shape: Layers, width, heads and normalization
-    """
-    # Whatever the libraries print must not get among the messages.
-    messages = os.fdopen(os.dup(sys.stdout.fileno()), "w")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    warnings.simplefilter("ignore")
-    logging.disable(logging.WARNING)
-
-    from lightning.pytorch import Callback  # type: ignore[import-not-found]
-    from rl4co.envs import OPEnv  # type: ignore[import-not-found]
-    from rl4co.envs.routing.op.generator import OPGenerator  # type: ignore[import-not-found]
-    from rl4co.models import REINFORCE, AttentionModelPolicy  # type: ignore[import-not-found]
-    from rl4co.utils import RL4COTrainer  # type: ignore[import-not-found]
-
-    # Not earlier: these imports set another number.
-    th.set_num_threads(num_threads)
-    th.manual_seed(0)
-
-    class Turns(Callback):
-        """
-        Trains in turns with the other competitors.
-
-        From the start of an epoch to that of the next are its updates and the instances of the next with their rollouts.
-        """
-
-        clock: Clock | None = None
-
-        def on_train_epoch_start(self, trainer: Any, model: Any) -> None:
-            if trainer.current_epoch == 0:
-                return
-            if self.clock is None:
-                assert th.get_num_threads() == num_threads
-                # No test of the baseline's policy from now on.
-                model.baseline.epoch_callback = lambda *args, **kwargs: None
-                self._wait("ready")
-                return
-            self.n_epochs += 1
-            elapsed = self.clock.read()
-            if elapsed[0] >= self.seconds:
-                n_instances = self.n_epochs * epoch_batches * batch_size
-                self._wait(Measurement(n_instances, *elapsed, sum(self.returns) / len(self.returns)))
-
-        def on_train_batch_end(self, trainer: Any, model: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
-            if self.clock is not None:
-                self.returns.append(float(outputs["train/reward"]))
-
-        def _wait(self, message: Any) -> None:
-            print(json.dumps(message), file=messages, flush=True)
-            self.seconds = float(sys.stdin.readline())
-            self.n_epochs, self.returns, self.clock = 0, list[float](), Clock()
-
-    generator = OPGenerator(num_loc=n_tasks, max_length=max_distance, prize_type="const")
-    # RL4CO 0.7.0 looks there for the device of constant prizes but never sets it.
-    generator.device = "cpu"
-    env = OPEnv(generator)
-    policy = AttentionModelPolicy(
-        env_name=env.name,
-        embed_dim=shape["embed_dim"],
-        num_encoder_layers=shape["n_layers"],
-        num_heads=shape["n_heads"],
-        feedforward_hidden=shape["ff_dim"],
-        normalization=shape["normalization"],
-    )
-    # Neither validation nor the baseline's test is measured: the smallest sets that setting them up allows.
-    model = REINFORCE(
-        env,
-        policy,
-        baseline="rollout",
-        batch_size=batch_size,
-        train_data_size=epoch_batches * batch_size,
-        val_data_size=2,
-        test_data_size=2,
-        optimizer_kwargs={"lr": 1e-4},
-    )
-    trainer = RL4COTrainer(
-        accelerator="cpu",
-        devices=1,
-        precision="32-true",
-        max_epochs=10**9,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        limit_val_batches=0,
-        num_sanity_val_steps=0,
-        callbacks=[Turns()],
-    )
-    trainer.fit(model)
 
 
 # -------------------------------------------------------------------------------------------------------------- report
@@ -394,8 +265,8 @@ def report(level: str, n_samples: dict[str, int], measured: dict[str, list[Measu
 
 def to_csv(rows: list[dict[str, Any]]) -> str:
     """
-    :param rows: One measurement each
-    :return: They as CSV
+    :param rows: Measurements
+    :return: The rows as CSV
     """
     stream = io.StringIO()
     writer = csv.DictWriter(stream, rows[0], lineterminator="\n")
@@ -407,7 +278,7 @@ def to_csv(rows: list[dict[str, Any]]) -> str:
 def compete(level: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     """
     :param level: ``"allocator"`` or ``"router"``
-    :param args: Of the command line
+    :param args: Arguments of the command line
     :return: Rows of the CSV
     """
     with ExitStack() as stack:
@@ -448,17 +319,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--max-distance", type=float, default=2.0)
     parser.add_argument("--batch-size", type=int, default=64, help="instances per update")
     parser.add_argument("--epoch-batches", type=int, default=4, help="updates per epoch")
-    parser.add_argument("--seconds", type=float, default=10.0, help="least duration of a measurement")
+    parser.add_argument("--seconds", type=float, default=10.0, help="minimum duration of a measurement")
     parser.add_argument("--rounds", type=int, default=3, help="measurements of every competitor")
     parser.add_argument("--num-threads", type=int, default=1)
     parser.add_argument("--rl4co", metavar="PYTHON", help="Python of an environment with RL4CO; without it, RL4CO is left out")
-    parser.add_argument("--out", type=Path, metavar="CSV", help="where to write the measurements")
-    parser.add_argument("--serve", help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, metavar="CSV", help="output file of the measurements")
     args = parser.parse_args(arguments)
-    if args.serve is not None:
-        serve(**json.loads(args.serve))
-        return
-
     print(
         f"N = {args.n_tasks}, V = {args.n_uavs}, D = {args.max_distance:g}, batches of {args.batch_size}, "
         f"{args.rounds} rounds of {args.seconds:g} s, {args.num_threads} threads, torch {th.__version__}"

@@ -1,8 +1,7 @@
 """
-A trained pair on new instances, against K-means and the nearest task, every schedule checked, one of them drawn.
+Evaluates a trained pair on new instances against K-means with nearest-task tours, checks all schedules and draws one.
 
-``python its_ppo.py`` writes the two zips that this reads; those of ``sb3-uav train`` do as well. Needs
-``pip install 'sb3-uav[plots]'``.
+``python its_ppo.py`` writes the two zips; those of ``sb3-uav train`` work too. Needs the extra ``plots``.
 """
 
 import argparse
@@ -23,7 +22,7 @@ parser.add_argument("--n-instances", type=int, default=100, help="default: %(def
 parser.add_argument("--out", type=Path, default=Path("schedule.png"), help="default: %(default)s")
 args = parser.parse_args()
 
-# Zips are read without unpickling anything, so those of other people are safe.
+# Zips are read without unpickling, so it is safe to load those of other people.
 allocator = load_policy(args.allocator, expected=AllocatorPolicy)
 router = load_policy(args.router, expected=RouterPolicy)
 instances = UniformGenerator(20, n_uavs=3, max_distance=1.5)(args.n_instances, np.random.default_rng(7))

@@ -1,10 +1,10 @@
 """
-A pre-trained attention encoder, frozen, under a new policy: only what stands on top of it learns.
+A frozen, pre-trained attention encoder under a new policy, of which only decoder and critic are trained.
 
-REINFORCE trains a router; PPO takes its encoder over and trains another decoder and critic.
+REINFORCE trains a router; PPO reuses its encoder and trains a new decoder and critic.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 
@@ -17,7 +17,7 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import EpisodeRolloutBuffer, Freezer
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--timesteps", type=int, default=300_000, help="of each of the two, default: %(default)s")
+parser.add_argument("--timesteps", type=int, default=300_000, help="steps of each training, default: %(default)s")
 args = parser.parse_args()
 
 network = dict(embed_dim=32, n_layers=2, n_heads=4, ff_dim=64)

@@ -1,10 +1,10 @@
 """
-The interactive training strategy with stock PPO on both levels: an allocator, and a router that learns beside it.
+The interactive training strategy with stock PPO on both levels: an allocator, and a router trained beside it.
 
 Writes ``allocator.zip`` and ``router.zip``, which ``evaluate_and_draw.py`` reads.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 from pathlib import Path
@@ -17,7 +17,7 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.training import EpisodeRolloutBuffer, ITSCallback
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--timesteps", type=int, default=768_000, help="of the allocator, default: %(default)s")
+parser.add_argument("--timesteps", type=int, default=768_000, help="steps of the allocator, default: %(default)s")
 parser.add_argument("--out", type=Path, default=Path("pair"), help="folder of the zips, default: %(default)s")
 args = parser.parse_args()
 
@@ -31,7 +31,7 @@ settings = dict(
     policy_kwargs=dict(embed_dim=32, n_layers=2, n_heads=4, ff_dim=64),
     rollout_buffer_class=EpisodeRolloutBuffer,
 )
-# An episode of the allocator has 20 steps, its one reward comes with the last.
+# An episode of the allocator has 20 steps; its only reward comes with the last.
 allocator = PPO(AllocatorPolicy, env, n_steps=20, gae_lambda=0.95, ent_coef=0.01, seed=0, **settings)
 router = dict(algo="ppo", policy="RouterPolicy", n_envs=64, n_steps=20, gae_lambda=0.98, **settings)
 n_epochs = 6
@@ -41,7 +41,7 @@ its = ITSCallback(
     n_pretraining_epochs=3,
     n_intensive_epochs=4,
     n_continuous_epochs=2,
-    # SB3's algorithms count steps: an epoch is a part of them.
+    # SB3's algorithms count steps; this sets the instances of an epoch.
     instances_per_epoch=max(args.timesteps // 20 // n_epochs, 64),
     save_path=str(args.out),
     verbose=1,

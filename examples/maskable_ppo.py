@@ -1,11 +1,11 @@
 """
-Stock MaskablePPO of sb3-contrib. It asks the environment for its action masks while it learns.
+Stock MaskablePPO of sb3-contrib, which gets its action masks from the environment during training.
 
-For evaluation, ``predict`` and ``EvalCallback`` nobody has to pass masks, because they are in the observation too: the tours
-below contain no illegal action.
+``predict``, evaluation and ``EvalCallback`` need no masks, because the observation contains them too: the tours below have no
+illegal actions.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 

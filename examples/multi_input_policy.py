@@ -1,11 +1,11 @@
 """
 Our attention extractors inside SB3's own ``MultiInputPolicy``, with any ``net_arch`` on top.
 
-The allocator may give any task to any UAV, so stock PPO needs no masks. The router must not fly where it cannot come home
-from: there MaskablePPO's ``MultiInputPolicy`` takes the masks from the environment.
+The allocator may assign any task to any UAV, so stock PPO needs no masks. The router must be able to return to the depot:
+MaskablePPO's ``MultiInputPolicy`` takes its masks from the environment.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 

@@ -1,11 +1,11 @@
 """
-Your own coordinates: arrays in metres, scaled for the networks, trained on, planned, and read back in metres.
+Your own coordinates: arrays in meters, scaled for the networks, used for training and planning, and read back in meters.
 
-The environment trains on variants of the site: its tasks, moved a little. Instances may also come from a file
+Training uses variants of the site with slightly moved tasks. Instances may also come from a file
 (``instances="tasks.npz"``, written by ``Instances.save``), or from any function of this form.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 
@@ -24,7 +24,7 @@ depot_m = np.array([1200.0, 800.0])
 tasks_m = rng.uniform([0.0, 0.0], [3000.0, 2000.0], size=(15, 2))
 range_m, n_uavs = 5000.0, 2
 
-# Networks expect about the unit square; the flight distance is scaled with the coordinates.
+# Networks expect roughly the unit square; the flight distance is scaled with the coordinates.
 scale = 1.0 / 3000.0
 site = Instances.from_arrays(depot_m * scale, tasks_m * scale, max_distance=range_m * scale, n_uavs=n_uavs)
 

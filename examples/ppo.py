@@ -1,10 +1,10 @@
 """
 Stock PPO on one of our environments: our policy, all rows in one ``BatchedVecEnv``, minibatches of whole episodes.
 
-Nothing here is a subclass of PPO. Leave ``rollout_buffer_class`` out and it still trains, only slower.
+Nothing here subclasses PPO. Without ``rollout_buffer_class`` it still trains, only slower.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 

@@ -5,7 +5,7 @@ It is an SB3 algorithm: callbacks, TensorBoard, ``save`` and ``load`` as usual. 
 instances without an environment.
 """
 
-# SB3 takes more than its annotations say.
+# SB3 accepts more types than its annotations state.
 # mypy: disable-error-code="arg-type"
 import argparse
 import tempfile

@@ -1,4 +1,4 @@
-"""Environment ids. Importing this module needs gymnasium alone; the environments are imported when they are made."""
+"""Environment ids. Importing this module requires only gymnasium; the environments are imported when they are made."""
 
 from typing import Any
 
@@ -6,10 +6,10 @@ import gymnasium as gym
 
 PAPER_FLEETS = (4, 6)
 PAPER_SIZES = (80, 100, 150, 200, 300, 500)
-GENERALISATION_SIZES = (600, 700, 800, 900, 1000, 1500)
-# With the paper's D = 2.0, nearly all of so few tasks could be visited, and there would be little to learn.
+GENERALIZATION_SIZES = (600, 700, 800, 900, 1000, 1500)
+# With the paper's D = 2.0, almost all of these few tasks could be visited, and there would be little to learn.
 DEMO_FLEET, DEMO_SIZE, DEMO_MAX_DISTANCE = 3, 20, 1.5
-# Training batches of mixed sizes, for one pair of networks that serves them all.
+# Training batches of mixed sizes, for one pair of networks that handles all of them.
 UNIVERSAL_ID, UNIVERSAL_FLEET, UNIVERSAL_SIZE = "TaskAllocation-Universal-v0", 8, 500
 
 
@@ -22,8 +22,8 @@ def routing_id(n_tasks: int) -> str:
 
 
 def register_envs() -> None:
-    """Register the scenarios of the paper (D = 2.0), of the demo and the mixture; registering twice changes nothing."""
-    sizes = (*PAPER_SIZES, *GENERALISATION_SIZES)
+    """Register the paper's scenarios (D = 2.0), the demo and the mixture. Registering them again has no effect."""
+    sizes = (*PAPER_SIZES, *GENERALIZATION_SIZES)
     for n_uavs in PAPER_FLEETS:
         for n_tasks in sizes:
             _register(allocation_id(n_uavs, n_tasks), "allocation:TaskAllocationEnv", n_tasks, n_uavs=n_uavs)
@@ -41,7 +41,7 @@ def _register(env_id: str, entry_point: str, n_tasks: int, **kwargs: Any) -> Non
         gym.register(
             id=env_id,
             entry_point=f"sb3_uav.envs.{entry_point}",
-            # No max_episode_steps: episodes end by themselves after at most n_tasks + 1 steps, and a limit would cut longer
-            # ones off when the id is made with another n_tasks.
+            # No max_episode_steps: episodes end after at most n_tasks + 1 steps, and a limit would truncate longer ones when
+            # the environment is made with another n_tasks.
             kwargs={"n_tasks": n_tasks, **kwargs},
         )

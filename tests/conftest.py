@@ -1,4 +1,4 @@
-"""What the tests of the environments share: settings, strategies that draw instances, and small plain-Python helpers."""
+"""Shared by all tests: settings, fixtures, Hypothesis strategies for instances, and small helpers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
+from sb3_uav.envs.allocation import UNASSIGNED
 from sb3_uav.envs.problem import Dynamics
 
 if TYPE_CHECKING:
     from classical_helpers import Ticks
     from evaluate_cli_helpers import Inputs
 
-# Repeatable on CI; `--hypothesis-profile=explore` searches on.
+# Repeatable on CI; `--hypothesis-profile=explore` tries other examples.
 settings.register_profile("repeatable", deadline=None, derandomize=True, print_blob=True)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("repeatable")
 
-# Tiny tensors: more threads only get into each other's way.
+# With tiny tensors, more threads only slow each other down.
 th.set_num_threads(1)
 
 seeds = st.integers(0, 2**32 - 1)
@@ -35,7 +36,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @pytest.fixture(scope="session", autouse=True)
 def _sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """SB3's loggers leave a folder for every model in the system's temporary folder otherwise."""
+    """Otherwise, SB3's loggers create a folder per model in the system's temporary folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("sb3_logs")))
         yield
@@ -133,11 +134,27 @@ def random_legal(mask: th.Tensor, generator: np.random.Generator) -> th.Tensor:
     One legal action per row, uniformly.
 
     :param mask: ``(..., n_actions)`` bool
-    :param generator: The source of randomness
+    :param generator: Random generator
     :return: ``(...)`` int64
     """
     scores = th.from_numpy(generator.random(tuple(mask.shape)))
     return scores.masked_fill(~mask, -1.0).argmax(-1)
+
+
+def random_assignment(
+    instances: Instances, n_samples: int, generator: np.random.Generator, partial: bool = False
+) -> th.Tensor:
+    """
+    Any UAV for every task.
+
+    :param instances: ``batch`` instances
+    :param n_samples: Allocations per instance
+    :param generator: Random generator
+    :param partial: Whether some tasks are left without a UAV
+    :return: ``(batch, n_samples, n_tasks)`` int64
+    """
+    low = UNASSIGNED if partial else 0
+    return th.from_numpy(generator.integers(low, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
 
 
 def play_randomly(
@@ -148,7 +165,7 @@ def play_randomly(
 
     :param dynamics: Of ``batch`` instances
     :param n_samples: Episodes per instance
-    :param generator: The source of randomness
+    :param generator: Random generator
     :param min_steps: How many steps to play even if all episodes are over
     :return: Actions ``(batch, n_samples, n_steps)`` int64, and the reward of each, float64
     """

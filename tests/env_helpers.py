@@ -1,4 +1,4 @@
-"""What the tests of the environments share."""
+"""Helpers for the tests of the environments."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def play(env: ProblemEnv, rng: np.random.Generator, **reset_kwargs: Any) -> tupl
 
 
 def overwrite(*arrays: np.ndarray) -> None:
-    """Destroy what an environment has handed out."""
+    """Overwrite arrays that an environment has returned."""
     for array in arrays:
         array[...] = array == 0
 
@@ -85,14 +85,14 @@ def legal_actions(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
 
 
 def assert_same_arrays(a: Any, b: Any) -> None:
-    """Two Dict observations, keys in the same order, dtypes and values."""
+    """Two Dict observations have the same keys in the same order, dtypes and values."""
     assert list(a) == list(b)
     for key in a:
         assert a[key].dtype == b[key].dtype and np.array_equal(a[key], b[key]), key
 
 
 def assert_same_infos(a: dict[str, Any], b: dict[str, Any]) -> None:
-    """Everything but the clock."""
+    """All infos are equal except for times."""
     assert set(a) - {"TimeLimit.truncated"} == set(b) - {"TimeLimit.truncated"}
     assert a.get("TimeLimit.truncated", False) == b.get("TimeLimit.truncated", False)
     assert a["illegal_actions"] == b["illegal_actions"]

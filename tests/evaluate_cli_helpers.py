@@ -39,6 +39,10 @@ class Inputs:
         UniformGenerator(60, n_uavs=3)(2, np.random.default_rng(1)).pad(64).save(self.large)
 
     @property
+    def zips(self) -> str:
+        return f"allocator={self.allocator},router={self.router}"
+
+    @property
     def pair(self) -> list[str]:
         return ["--allocator", str(self.allocator), "--router", str(self.router), "--device", "cpu"]
 

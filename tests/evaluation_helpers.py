@@ -80,7 +80,7 @@ class Choosy(Stub):
 
     def check(self, instances: Instances) -> None:
         if instances.n_uavs > 2:
-            raise RuntimeError("the licence is too small")
+            raise RuntimeError("the license is too small")
 
 
 class Mortal(OneByOneSolver):

@@ -1,4 +1,4 @@
-"""What the tests of instances share: valid arrays, broken ones, and a comparison bit by bit."""
+"""Helpers for the tests of instances: valid and invalid arrays, and a bitwise comparison."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_uav.envs.instances import TENSOR_FIELDS
 
 
 def assert_equal(a: Instances, b: Instances) -> None:
-    """Bit by bit."""
+    """Bitwise."""
     assert a.n_uavs == b.n_uavs
     for name in TENSOR_FIELDS:
         assert getattr(a, name).dtype == getattr(b, name).dtype

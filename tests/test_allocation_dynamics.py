@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
-from conftest import instance_batches, play_randomly, random_legal, seeds
+from conftest import instance_batches, play_randomly, random_assignment, random_legal, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ from sb3_uav.envs.routing import DEPOT, RoutingDynamics
 
 
 def random_router(generator: np.random.Generator) -> Router:
-    """Flies to any task that still fits."""
+    """Flies to random feasible tasks."""
     return lambda instances: play_randomly(RoutingDynamics(instances), 1, generator)[0][:, 0]
 
 
@@ -35,9 +35,7 @@ def random_router(generator: np.random.Generator) -> Router:
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 3), partial=st.booleans())
 def test_split_gives_every_task_to_one_uav(instances: Instances, seed: int, n_samples: int, partial: bool) -> None:
     """Each UAV's tasks, in their order, at the front of its row, with the data of the original; then padding."""
-    rng = np.random.default_rng(seed)
-    low = UNASSIGNED if partial else 0
-    assignment = th.from_numpy(rng.integers(low, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
+    assignment = random_assignment(instances, n_samples, np.random.default_rng(seed), partial)
     subsets = split_tasks(instances, assignment)
     subsets.instances.validate()
     assert len(subsets.instances) == len(subsets.task_index) == len(instances) * n_samples * instances.n_uavs
@@ -61,9 +59,9 @@ def test_split_gives_every_task_to_one_uav(instances: Instances, seed: int, n_sa
 @settings(max_examples=60)
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 3), greedy=st.booleans())
 def test_planned_tours_pass_the_checker(instances: Instances, seed: int, n_samples: int, greedy: bool) -> None:
-    """Their value is the checker's objective, and every UAV visits tasks of its own only."""
+    """Their value is the checker's objective, and every UAV visits only its own tasks."""
     rng = np.random.default_rng(seed)
-    assignment = th.from_numpy(rng.integers(0, instances.n_uavs, (len(instances), n_samples, instances.n_tasks)))
+    assignment = random_assignment(instances, n_samples, rng)
     planned = plan_tours(instances, assignment, nearest_feasible if greedy else random_router(rng))
     assert planned.tours.shape[:3] == (len(instances), n_samples, instances.n_uavs)
     assert planned.value.shape == (len(instances), n_samples) and planned.value.dtype == th.float64
@@ -78,7 +76,7 @@ def test_planned_tours_pass_the_checker(instances: Instances, seed: int, n_sampl
 @settings(max_examples=60)
 @given(instances=instance_batches(), seed=seeds)
 def test_allocation_rewards_only_the_end(instances: Instances, seed: int) -> None:
-    """Tasks in input order, one a step; the value of the router's tours when the last real one has a UAV."""
+    """One task per step in input order; the value of the router's tours when the last real task is assigned."""
     rng = np.random.default_rng(seed)
     dynamics = AllocationDynamics(instances, nearest_feasible)
     state = dynamics.reset(2)
@@ -98,7 +96,7 @@ def test_allocation_rewards_only_the_end(instances: Instances, seed: int) -> Non
 
 @pytest.mark.parametrize("n_uavs", [1, 2, 3, 5, 20])
 def test_more_uavs_than_tasks(n_uavs: int) -> None:
-    """Idle UAVs fly nowhere; with a UAV each, all reachable tasks are visited."""
+    """Idle UAVs stay at the depot; with one UAV per task, all reachable tasks are visited."""
     instances = UniformGenerator(n_tasks=3, n_uavs=n_uavs, max_distance=9.0)(4, np.random.default_rng(0))
     assignment = (th.arange(3) % n_uavs).expand(4, 1, 3)
     planned = plan_tours(instances, assignment, nearest_feasible)
@@ -108,7 +106,7 @@ def test_more_uavs_than_tasks(n_uavs: int) -> None:
 
 
 def test_distance_too_short_for_anything() -> None:
-    """The one legal action is to stay at home, and the value is 0."""
+    """The only legal action is to stay at the depot, and the value is 0."""
     instances = Instances.from_arrays([0, 0], [[1, 0], [0, 1]], max_distance=1.0, n_uavs=2)
     assert nearest_feasible(instances).tolist() == [[DEPOT]]
     planned = plan_tours(instances, th.tensor([[[0, 1]]]), nearest_feasible)

@@ -19,6 +19,7 @@ TINY = ["--n-tasks", "5", "--n-uavs", "2", "--batch-size", "4", "--epoch-batches
 
 @pytest.fixture(scope="module")
 def benchmark():
+    sys.path.insert(0, str(SCRIPT.parent))
     specification = importlib.util.spec_from_file_location("training_throughput", SCRIPT)
     assert specification is not None and specification.loader is not None
     module = importlib.util.module_from_spec(specification)
@@ -64,5 +65,5 @@ def test_a_failing_rl4co_is_reported(benchmark, tmp_path):
     broken = tmp_path / "python"
     broken.write_text(f"#!{sys.executable}\nraise SystemExit(3)\n")
     broken.chmod(0o755)
-    with pytest.raises(RuntimeError, match=r"--serve.* ended with 3; see"):
+    with pytest.raises(RuntimeError, match=r"_rl4co_server.* ended with 3; see"):
         benchmark.main([*TINY, "--level", "router", "--rl4co", str(broken)])

@@ -172,7 +172,7 @@ def test_variants_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[1, 2]", "must be a mapping from names"),
+        ("[1, 2]", r"variants\.yml: holds \[1, 2\] \(list\) instead of a mapping"),
         ("{}", "must be a mapping from names"),
         ("a: {n_envs: 3}", "at least the key 'algo'"),
         ("a: {algo: dqn}", r"algo 'dqn': there is no YAML zoo_configs/dqn\.yml; name one as conf_file"),
@@ -315,7 +315,7 @@ def test_failed_runs_are_named_after_the_others_are_through(behaviour, steps, me
 
 def test_jobs_run_side_by_side(tmp_path):
     """Each of two waits for the other to begin; one after the other they would wait for ever."""
-    wait = "open({0!r}, 'w')\nfor _ in range(600):\n    if os.path.exists({1!r}):\n        break\n    time.sleep(0.05)\n"
+    wait = "open({0!r}, 'w')\nfor _ in range(12000):\n    if os.path.exists({1!r}):\n        break\n    time.sleep(0.05)\n"
     wait += "else:\n    sys.exit('alone')"
     a, b = str(tmp_path / "a"), str(tmp_path / "b")
     train_all([fake(tmp_path, wait.format(a, b)), fake(tmp_path, wait.format(b, a), seed=1)], 2)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, ResultRow
-from sb3_uav.evaluation.summary import SUMMARY_COLUMNS, gaps, optimality_gap, summarise, write_summary
+from sb3_uav.evaluation.summary import SUMMARY_COLUMNS, gaps, optimality_gap, summarize, write_summary
 from sb3_uav.evaluation.table import print_table
 
 
@@ -74,7 +74,7 @@ def test_paired_differences_by_hand() -> None:
     Differences 3, 1, 2, 4: mean 2.5, standard deviation sqrt(5/3) = 1.2910, standard error 0.6455; Student's t for 3 degrees
     of freedom is 3.182, so the interval is 2.5 +- 2.054. The means alone, 12.5 and 10 with errors of about 4, say nothing.
     """
-    reference, other = summarise("set", results(a=[2.0, 6.0, 13.0, 19.0], b=[5.0, 7.0, 15.0, 23.0]), "a")
+    reference, other = summarize("set", results(a=[2.0, 6.0, 13.0, 19.0], b=[5.0, 7.0, 15.0, 23.0]), "a")
     assert (other.n_paired, other.difference) == (4, 2.5)
     assert other.difference_low == pytest.approx(2.5 - 2.054, abs=5e-4)
     assert other.difference_high == pytest.approx(2.5 + 2.054, abs=5e-4)
@@ -110,7 +110,7 @@ def test_bounds_by_hand() -> None:
         "loose": make_rows("loose", [3.0, 8.0, 6.0, 0.0], [8.0, 9.0, None, 7.0]),
         "heuristic": make_rows("heuristic", [2.0, 9.0, 9.0, 0.0]),
     }
-    exact, loose, heuristic = summarise("set", found, "heuristic")
+    exact, loose, heuristic = summarize("set", found, "heuristic")
     assert (exact.n_bounds, exact.bound) == (4, 6.5)
     assert (loose.n_bounds, loose.bound) == (3, 8.0)
     assert (heuristic.n_bounds, math.isnan(heuristic.bound)) == (0, True)
@@ -123,7 +123,7 @@ def test_bounds_by_hand() -> None:
 
 def test_a_bound_below_what_is_achieved_is_wrong() -> None:
     found = {"liar": make_rows("liar", [4.0, 4.0], [4.0, 4.9999]), "other": make_rows("other", [4.0000001, 5.0])}
-    liar, other = summarise("set", found, "other")
+    liar, other = summarize("set", found, "other")
     assert liar.violations == (
         "liar, instance 1 of set: its upper bound of 4.9999 is below 5, which a feasible schedule achieves.",
     )
@@ -132,7 +132,7 @@ def test_a_bound_below_what_is_achieved_is_wrong() -> None:
 
 def test_failures_leave_the_others_comparable() -> None:
     """Only the same instances are compared, and who failed on some has no gap, because its mean is over others."""
-    a, b, c = summarise("set", results(a=[10.0, None, 30.0, 1.0], b=[12.0, 99.0, 31.0, None], c=[None] * 4), "a")
+    a, b, c = summarize("set", results(a=[10.0, None, 30.0, 1.0], b=[12.0, 99.0, 31.0, None], c=[None] * 4), "a")
     assert (b.n_paired, b.difference, b.n_feasible) == (2, 1.5, 3)
     assert b.ratio == pytest.approx(21.5 / 20)
     assert all(math.isnan(row.gap) for row in (a, b, c))
@@ -145,7 +145,7 @@ def test_failures_leave_the_others_comparable() -> None:
 def test_infeasible_schedules_are_named() -> None:
     rows = make_rows("a", [1.0, None])
     rows[1] = ResultRow(**{**vars(rows[1]), "status": INFEASIBLE, "message": "UAV 0 flies too far."})
-    (row,) = summarise("set", {"a": rows}, "a")
+    (row,) = summarize("set", {"a": rows}, "a")
     assert row.violations == ("a, instance 1 of set: UAV 0 flies too far.",) and row.failures == ()
 
 
@@ -160,17 +160,17 @@ objective_lists = st.lists(
 def test_summaries_of_any_results(objectives: list[list[float | None]], order: list[int]) -> None:
     """Differences are antisymmetric, the best has gap 0, and the order of the instances does not matter."""
     found = {str(i): make_rows(str(i), values) for i, values in enumerate(objectives)}
-    summary = summarise("set", found, "0")
+    summary = summarize("set", found, "0")
     complete = [row.gap for row in summary if row.n_feasible == 5]
     assert not complete or (min(complete) == 0.0 and max(complete) <= 100.0)
     assert all(math.isnan(row.gap) for row in summary if row.n_feasible < 5)
     for row in summary:
-        (back,) = [other for other in summarise("set", found, row.solver) if other.solver == "0"]
+        (back,) = [other for other in summarize("set", found, row.solver) if other.solver == "0"]
         assert back.n_paired == row.n_paired
         np.testing.assert_allclose(back.difference, -row.difference, atol=1e-9, equal_nan=True)
         np.testing.assert_allclose(back.difference_low, -row.difference_high, atol=1e-6, equal_nan=True)
     shuffled = {str(i): make_rows(str(i), [values[j] for j in order]) for i, values in enumerate(objectives)}
-    for one, other in zip(summary, summarise("set", shuffled, "0"), strict=True):
+    for one, other in zip(summary, summarize("set", shuffled, "0"), strict=True):
         figures = (one.objective, one.standard_error, one.gap, one.difference, one.difference_low, one.ratio)
         again = (other.objective, other.standard_error, other.gap, other.difference, other.difference_low, other.ratio)
         np.testing.assert_allclose(figures, again, rtol=1e-6, atol=1e-6, equal_nan=True)
@@ -182,7 +182,7 @@ def test_summaries_of_any_results(objectives: list[list[float | None]], order: l
 def test_summary_files(tmp_path: Path) -> None:
     """Both hold the same figures, and no NaN, which JSON does not have."""
     found = {"a": make_rows("a", [1.0, 3.0], [4.0, 4.0]), "b, c": make_rows("b, c", [None, 2.0])}
-    summary = summarise("set", found, "a", time_limit=0.5)
+    summary = summarize("set", found, "a", time_limit=0.5)
     write_summary(summary, tmp_path, {"reference": "a", "seed": 3})
     text = (tmp_path / "summary.json").read_text()
     told = json.loads(text)
@@ -206,14 +206,14 @@ def table_lines(capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 def test_table_shows_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
     plain = {"a[b]": make_rows("a[b]", [2.0, 6.0, 13.0, 19.0]), "b": make_rows("b", [5.0, 7.0, 15.0, 23.0])}
-    print_table(summarise("set", plain, "a[b]", 2.0))
+    print_table(summarize("set", plain, "a[b]", 2.0))
     lines = table_lines(capsys)
     assert lines[0] == "set: 4 instances, 2 s each"
     assert lines[1:3] == ["Std. Gap s per", "Solver Obj. error % Difference instance"]
     assert lines[4:6] == ["a[b] 10.00 3.76 20.00 reference 2.0000", "b 12.50 4.11 0.00 +2.50 ± 2.05 2.0000"]
     assert lines[6] == "Difference: to a[b] on the same instances, with 95 % confidence"
 
-    print_table(summarise("set", {"a": make_rows("a", [2.0, None], [4.0, None]), "b": make_rows("b", [1.0, 1.0])}, "b"))
+    print_table(summarize("set", {"a": make_rows("a", [2.0, None], [4.0, None]), "b": make_rows("b", [1.0, 1.0])}, "b"))
     lines = table_lines(capsys)
     assert lines[2] == "Solver Obj. error % Difference Bound gap % instance Feasible"
     assert lines[4:6] == [
@@ -221,7 +221,7 @@ def test_table_shows_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
         "b 1.00 0.00 0.00 reference - 75.00 1.0000 2/2",
     ]
 
-    print_table(summarise("set", {"alone": make_rows("alone", [None])}, "alone"))
+    print_table(summarize("set", {"alone": make_rows("alone", [None])}, "alone"))
     lines = table_lines(capsys)
     assert lines[2:] == ["Solver Obj. error % instance Feasible", lines[3], "alone - - - - 0/1"]
 
@@ -230,7 +230,7 @@ def test_table_fits_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: 
     """With 80 columns, names are folded and figures are whole; where the output is a file, no name is folded."""
     name = "dl-drl:allocator=a/rather/long/path/allocator.zip,router=a/rather/long/path/router.zip"
     found = {name: make_rows(name, [52.0, 60.5], [80.0, 80.0]), "b": make_rows("b", [10.0, 35.0], [80.0, 80.0])}
-    summary = summarise("set", found, name)
+    summary = summarize("set", found, name)
     print_table(summary)
     assert any(line.startswith(f"{name} 56.25 4.25 0.00 reference 80.00 29.69 1.0000") for line in table_lines(capsys))
     monkeypatch.setenv("FORCE_COLOR", "1")

@@ -167,7 +167,7 @@ def test_decoded_episodes_can_be_replayed(level: str, preset: str, instances: In
 def test_fused_evaluation_equals_the_step_loop(
     level: str, preset: str, instances: Instances, n_samples: int, seed: int, gradients: bool
 ) -> None:
-    """Log-probabilities, values and entropies of every step, with SB3's loop encoding each step anew or keeping encodings."""
+    """Log-probabilities, values and entropies of every step, SB3's loop with and without kept encodings."""
     policy = make_policy(level, preset, instances.n_tasks, instances.n_uavs)
     actions = sample(policy, instances, n_samples, seed)
     evaluation = policy.evaluate_episodes(instances, actions)

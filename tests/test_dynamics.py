@@ -31,7 +31,7 @@ def dynamics_of(level: str, instances: Instances) -> Dynamics:
 
 
 def start(level: str, instances: Instances, seed: int, n_samples: int) -> tuple[np.random.Generator, Dynamics, Any]:
-    """A source of random actions, the dynamics, and their initial state."""
+    """A random generator, the dynamics, and their initial state."""
     dynamics = dynamics_of(level, instances)
     return np.random.default_rng(seed), dynamics, dynamics.reset(n_samples)
 
@@ -52,7 +52,7 @@ both_levels = pytest.mark.parametrize("level", ["routing", "allocation"])
 @settings(max_examples=100)
 @given(instances=instance_batches(), seed=seeds, recklessness=st.sampled_from([0.0, 0.1, 1.0]))
 def test_some_action_is_always_legal(level: str, instances: Instances, seed: int, recklessness: float) -> None:
-    """In every state that any actions lead to, and every episode ends in time."""
+    """In every state that any actions can reach; and every episode ends in time."""
     rng, dynamics, state = start(level, instances, seed, 2)
     for _ in range(instances.n_tasks + 1):
         assert state.action_mask.any(-1).all()
@@ -67,7 +67,7 @@ def test_some_action_is_always_legal(level: str, instances: Instances, seed: int
 @settings(max_examples=40)
 @given(instances=instance_batches(), seed=seeds)
 def test_finished_episodes_stay_as_they_are(level: str, instances: Instances, seed: int) -> None:
-    """Whatever the action, however they ended, while other episodes of the batch go on; and without a reward."""
+    """Whatever the action and however they ended, while other episodes continue; and they earn no reward."""
     rng, dynamics, state = start(level, instances, seed, 3)
     for _ in range(instances.n_tasks + 3):
         done = state.done
@@ -86,7 +86,7 @@ def test_finished_episodes_stay_as_they_are(level: str, instances: Instances, se
 @settings(max_examples=40)
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 4))
 def test_samples_are_separate_episodes(level: str, instances: Instances, seed: int, n_samples: int) -> None:
-    """S samples of B instances in one state go, bit by bit, as B times S batches of one."""
+    """S samples of B instances in one state evolve bit-equally to B times S batches of one."""
     actions, rewards = play_randomly(dynamics_of(level, instances), n_samples, np.random.default_rng(seed))
     dynamics = dynamics_of(level, instances)
     together = [dynamics.reset(n_samples)]
@@ -119,9 +119,9 @@ def test_step_does_not_modify_the_state(level: str, instances: Instances, seed: 
 @settings(max_examples=60)
 @given(instances=instance_batches(), seed=seeds)
 def test_returns_rewards_and_lengths_of_whole_episodes(level: str, instances: Instances, seed: int) -> None:
-    """What a problem says of complete episodes is what the steps gave."""
+    """The results for complete episodes equal those of the steps."""
     problem = problem_of(level, instances)
-    # Allocations name a UAV for padded tasks too.
+    # Allocations have a UAV for padded tasks, too.
     n_steps = instances.n_tasks if level == "allocation" else 1
     actions, rewards = play_randomly(problem.dynamics(instances), 3, np.random.default_rng(seed), n_steps)
     returns = problem.returns(instances, actions)
@@ -136,7 +136,7 @@ def test_returns_rewards_and_lengths_of_whole_episodes(level: str, instances: In
 
 
 def steps_until_done(problem: Problem, instance: Instances, actions: list[int]) -> int:
-    """As an environment counts them."""
+    """Number of steps, counted by stepping."""
     episodes = Episodes(problem, 1)
     episodes.reset(given={0: instance})
     for n_steps, action in enumerate(actions, start=1):
@@ -147,7 +147,7 @@ def steps_until_done(problem: Problem, instance: Instances, actions: list[int]) 
 
 @both_levels
 def test_instance_without_any_task(level: str, small: Instances) -> None:
-    """A row of padding only, as a UAV without tasks is: one step of nothing."""
+    """A row with only padding, such as a UAV without tasks: one step without effect."""
     instances = replace(small, task_mask=th.zeros_like(small.task_mask))
     problem = problem_of(level, instances)
     state = problem.dynamics(instances).reset()
@@ -164,7 +164,7 @@ def test_instance_without_any_task(level: str, small: Instances) -> None:
 @settings(max_examples=40)
 @given(instances=instance_batches(), seed=seeds, exponent=st.integers(-60, 60))
 def test_unit_of_length_does_not_matter(level: str, instances: Instances, seed: int, exponent: int) -> None:
-    """Coordinates and D times a power of two, which rounds nothing: every mask and every reward stays."""
+    """Multiplying coordinates and D by a power of two, which is exact, changes no mask and no reward."""
     factor = 2.0**exponent
     scaled = replace(
         instances,

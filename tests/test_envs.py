@@ -44,7 +44,7 @@ SMALL_IDS = ["TaskAllocation-U3-N20-v0", "RoutePlanning-N20-v0"]
 
 @both_levels
 def test_seeds(level: str) -> None:
-    """The same seed gives the same episodes, one after the other; another seed gives others."""
+    """The same seed gives the same sequence of episodes, another seed a different one."""
     runs = []
     for seed in (1, 1, 2):
         env = make(level, n_tasks=6)
@@ -68,14 +68,14 @@ def test_seed_restarts_the_instances(level: str) -> None:
 @settings(max_examples=25)
 @given(instances=instance_batches(max_batch=1), seed=seeds)
 def test_given_instance_is_played(level: str, instances: Instances, seed: int) -> None:
-    """Of any size that fits; what is observed is that instance, padded, and its routes pass the checker."""
+    """Of any size that fits: the observations show that instance, padded, and the routes pass the checker."""
     rng = np.random.default_rng(seed)
     env = make(level, n_tasks=9, **({"n_uavs": instances.n_uavs} if level == "allocation" else {}))
     observations, rewards = play(env, rng, options={"instance": instances})
-    n_tasks = instances.n_tasks
+    n_tasks, shown = instances.n_tasks, instances.near_origin()
     for observation in observations:
-        assert observation["depot"] == pytest.approx(instances.depot[0].float().numpy())
-        assert np.array_equal(observation["tasks"][: 2 * n_tasks], instances.tasks[0].float().flatten().numpy())
+        assert np.array_equal(observation["depot"], shown.depot[0].float().numpy())
+        assert np.array_equal(observation["tasks"][: 2 * n_tasks], shown.tasks[0].float().flatten().numpy())
         assert np.array_equal(observation["task_values"][:n_tasks], instances.values[0].float().numpy())
         assert observation["task_mask"].tolist() == instances.task_mask[0].tolist() + [0] * (9 - n_tasks)
         assert observation["max_distance"] == instances.max_distance.float().numpy()
@@ -83,7 +83,7 @@ def test_given_instance_is_played(level: str, instances: Instances, seed: int) -
             assert not observation["visited"][observation["task_mask"] == 0].any()
     report = check_schedule(instances, 0, Schedule(env.episodes.routes(0)))
     assert report.objective == pytest.approx(sum(rewards), rel=1e-12, abs=0)
-    # The next episode draws again.
+    # The next episode draws an instance again.
     assert env.reset()[0]["task_mask"].all()
 
 
@@ -115,7 +115,7 @@ def test_bad_numbers_in_a_given_instance_are_refused(level: str) -> None:
 
 
 def test_fleet_of_a_given_instance() -> None:
-    """Allocation refuses another number of UAVs than its actions have; the router, who plans for one, does not care."""
+    """Allocation refuses a number of UAVs other than that of its actions; routing, which plans for one, accepts any."""
     instance = UniformGenerator(5, n_uavs=6)(1, np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"The instance has 6 UAVs, but the environment was made for 4; make .* n_uavs=6"):
         TaskAllocationEnv(n_tasks=5, n_uavs=4).reset(options={"instance": instance})
@@ -185,7 +185,7 @@ def test_bad_sizes_are_refused(level: str) -> None:
 
 @both_levels
 def test_set_generator(level: str) -> None:
-    """From the next episode on; one of another size is refused."""
+    """It takes effect with the next episode; one of another size is refused."""
     env = make(level, n_tasks=5)
     env.reset(seed=0)
     n_uavs = env.problem.generator.n_uavs
@@ -200,7 +200,7 @@ def test_set_generator(level: str) -> None:
 
 @pytest.mark.parametrize("env_id", SMALL_IDS)
 def test_ids_take_another_size(env_id: str) -> None:
-    """``gym.make(id, n_tasks=...)``, as with a zoo's ``env_kwargs``: episodes still end by themselves."""
+    """``gym.make(id, n_tasks=...)``, as with the zoo's ``env_kwargs``: episodes still end without truncation."""
     env = gym.make(env_id, n_tasks=40, max_distance=1000.0)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -221,7 +221,7 @@ def test_ids_take_another_size(env_id: str) -> None:
 @settings(max_examples=15)
 @given(seed=st.integers(0, 1000))
 def test_observations_hold_the_state(level: str, seed: int) -> None:
-    """The mask is that of ``action_masks``, the rest what the actions so far have led to."""
+    """The mask is that of ``action_masks``, and the rest follows from the actions so far."""
     rng = np.random.default_rng(seed)
     env = make(level, n_tasks=6, max_distance=1.5)
     observation, _ = env.reset(seed=seed)
@@ -243,6 +243,21 @@ def test_observations_hold_the_state(level: str, seed: int) -> None:
     assert env.action_masks().any()
 
 
+@both_levels
+@settings(max_examples=40)
+@given(instances=instance_batches(max_batch=1), seed=seeds, recklessness=st.sampled_from([0.0, 0.3, 1.0]))
+def test_some_action_is_legal_in_every_state(level: str, instances: Instances, seed: int, recklessness: float) -> None:
+    """For any instance, after legal and illegal actions, until the end and after it."""
+    rng = np.random.default_rng(seed)
+    env = make(level, n_tasks=9, **({"n_uavs": instances.n_uavs} if level == "allocation" else {}))
+    observation, _ = env.reset(options={"instance": instances})
+    for _ in range(11):
+        assert observation["action_mask"].any() and env.action_masks().any()
+        reckless = rng.random() < recklessness
+        observation, _, terminated, _, _ = env.step(env.action_space.sample() if reckless else act(env, rng))
+    assert terminated
+
+
 def check_open_length(instance: Instances, nodes: list[int]) -> float:
     """Length of the way from the depot through these nodes."""
     stops = np.vstack([instance.depot[0].numpy(), *(instance.tasks[0, node - 1].numpy() for node in nodes)])
@@ -251,7 +266,7 @@ def check_open_length(instance: Instances, nodes: list[int]) -> float:
 
 @both_levels
 def test_nothing_returned_shares_memory(level: str) -> None:
-    """Overwriting every array that an environment hands out changes neither the episode nor other observations."""
+    """Overwriting the arrays that an environment returns changes neither the episode nor other observations."""
     rewards = []
     for vandal in (False, True):
         rng = np.random.default_rng(0)
@@ -275,7 +290,7 @@ def test_nothing_returned_shares_memory(level: str) -> None:
 
 
 def test_illegal_actions_are_counted() -> None:
-    """They do not raise; the UAV flies home; the next episode counts from 0."""
+    """They do not raise, the UAV flies home, and the next episode counts from 0."""
     env = RoutePlanningEnv(n_tasks=5, max_distance=3.0)
     env.reset(seed=0)
     legal = int(np.flatnonzero(env.action_masks())[0])
@@ -338,7 +353,7 @@ def test_reward_of_the_allocation_env() -> None:
 
 
 def test_set_router() -> None:
-    """Counts from the next reward on, even in the middle of an episode; so does the constructor's argument."""
+    """It takes effect with the next reward, even during an episode; so does the constructor's argument."""
 
     def homebody(instances: Instances) -> th.Tensor:
         return th.zeros(len(instances), 1, dtype=th.int64)

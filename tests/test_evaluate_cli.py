@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from sb3_uav.common.files import file_hash
 from sb3_uav.envs import Instances, check_schedule
 from sb3_uav.envs.schedule import schedule_from_json
 from sb3_uav.solvers import SOLVERS
+from sb3_uav.solvers.decoding import DECODINGS
 
 # ---------------------------------------------------------------------------------------------------------------- the files
 
@@ -103,7 +105,7 @@ def test_infeasible_schedules_set_the_exit_code(
 
 def test_pairs_side_by_side(inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Zips are solvers like others; the options of the pair and those of a spec give the same schedules."""
-    zips = f"allocator={inputs.allocator},router={inputs.router}"
+    zips = inputs.zips
     code = run(
         *inputs.pair, "--decode", "sampling", "--samples", 2, "--instances", inputs.small, "--out", tmp_path,
         "--reference", "K-means+AM", "--solvers", f"dl-drl:{zips},decode=sampling,samples=2", f"dl-drl-i:{zips},name=DL-DRL-I",
@@ -124,10 +126,29 @@ def test_pairs_side_by_side(inputs: Inputs, tmp_path: Path, capsys: pytest.Captu
         assert files["router"] == {"path": str(inputs.router), "sha256": file_hash(inputs.router)}
 
 
+def test_every_decoding_of_the_solver_is_on_the_command_line(inputs: Inputs, tmp_path: Path) -> None:
+    for decode in DECODINGS:
+        out = tmp_path / decode
+        common = ("--decode", decode, "--samples", 2, "--instances", inputs.small, "--out", out)
+        assert run(*inputs.pair, *common, "--solvers", f"dl-drl:{inputs.zips},decode={decode},samples=2") == 0
+        lines = read_schedules(out)
+        assert len(lines) == 8 and [line["routes"] for line in lines[:4]] == [line["routes"] for line in lines[4:]]
+
+
+def test_zips_whose_paths_hold_commas(inputs: Inputs, tmp_path: Path) -> None:
+    folder = tmp_path / "mine, yours"
+    folder.mkdir()
+    for zip_file in (inputs.allocator, inputs.router):
+        shutil.copy(zip_file, folder)
+    spec = f"dl-drl:allocator=\"{folder / 'allocator.zip'}\",router='{folder / 'router.zip'}'"
+    assert run("--instances", inputs.small, "--out", tmp_path / "out", "--solvers", spec) == 0
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text())["solvers"][spec]
+    assert told["files"]["allocator"]["path"] == str(folder / "allocator.zip")
+
+
 def test_device_and_batch_size_are_for_all_networks(inputs: Inputs, tmp_path: Path) -> None:
-    zips = f"allocator={inputs.allocator},router={inputs.router}"
     common = ("--instances", inputs.small, "--out", tmp_path, "--batch-size", 3, "--device", "cpu", "--solvers")
-    assert run(*common, f"kmeans-am:router={inputs.router}", f"dl-drl:{zips},batch_size=2", "random-nearest") == 0
+    assert run(*common, f"kmeans-am:router={inputs.router}", f"dl-drl:{inputs.zips},batch_size=2", "random-nearest") == 0
     assert [row["batch_size"] for row in read_results(tmp_path)] == ["3"] * 3 + ["1"] + ["2"] * 4 + ["1"] * 4
 
 
@@ -169,7 +190,7 @@ def test_help_of_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
         "results.csv",
         "summary.json",
         "exit code:",
-        "  3    a solver or its licence is missing",
+        "  3    a solver or its license is missing",
         "dl-drl-i:",
     ):
         assert word in text

@@ -157,8 +157,8 @@ def test_a_solver_that_refuses_a_set(instances: Instances, tmp_path: Path) -> No
         ("choosy", "large", 0),
         ("stub", "large", 2),
     ]
-    assert summary[2].failures == ("choosy failed on 2 of 2 instances of large: RuntimeError: the licence is too small",)
-    with pytest.raises(ValueError, match="large: choosy cannot solve these instances: RuntimeError: the licence is too small"):
+    assert summary[2].failures == ("choosy failed on 2 of 2 instances of large: RuntimeError: the license is too small",)
+    with pytest.raises(ValueError, match="large: choosy cannot solve these instances: RuntimeError: the license is too small"):
         evaluate([Choosy()], {"large": large}, tmp_path / "none")
     assert not (tmp_path / "none").exists()
 

@@ -122,9 +122,9 @@ def test_folders_that_hold_something_else(instances: Instances, tmp_path: Path) 
         return str(error.value)
 
     short = instances.digest()[:8]
-    assert f"other instances, a (5, {short}) where now comes a (4" in refusal({"a": instances[:4]})
-    assert "other instances, a (5" in refusal({"b": instances[:1]})
-    assert "other instances, b (1" in refusal({"a": instances, "c": instances})
+    assert f"other instances: a (5, {short}), not a (4" in refusal({"a": instances[:4]})
+    assert "other instances: a (5" in refusal({"b": instances[:1]})
+    assert "other instances: b (1" in refusal({"a": instances, "c": instances})
     other = named("random-nearest", make_solver("kmeans-nearest"))
     message = refusal({"a": instances}, Stub(), other)
     assert (
@@ -141,9 +141,9 @@ def test_folders_that_hold_something_else(instances: Instances, tmp_path: Path) 
         ("results.csv", b"\xff\xfe\n", "results.csv: is damaged"),
         ("schedules.jsonl", "{}\n", "schedules.jsonl, line 1: is damaged"),
         ("schedules.jsonl", "[\n", "schedules.jsonl, line 1: is damaged"),
-        ("evaluation.json", "{", "evaluation.json: does not tell what the results.csv beside it holds"),
+        ("evaluation.json", "{", "evaluation.json: does not describe the results.csv beside it"),
         ("evaluation.json", '{"format": 2}', "its format is 2, expected 1"),
-        ("evaluation.json", '{"format": 1, "instances": [3], "solvers": {}, "runs": []}', "does not tell what"),
+        ("evaluation.json", '{"format": 1, "instances": [3], "solvers": {}, "runs": []}', "does not describe"),
     ],
 )
 def test_damaged_files(name: str, content: Any, message: str, instances: Instances, tmp_path: Path) -> None:

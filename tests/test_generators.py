@@ -33,7 +33,7 @@ class TestGenerators:
         assert (drawn.values == 1).all() and (drawn.max_distance == 1.5).all() and drawn.task_mask.all()
 
     def test_same_random_state_gives_the_same_instances(self, generator: InstanceGenerator) -> None:
-        """A call in between, with another source, leaves no trace."""
+        """A call in between, with another random generator, has no effect."""
         first = generator(3, np.random.default_rng(7))
         generator(5, np.random.default_rng(8))
         assert_equal(first, generator(3, np.random.default_rng(7)))
@@ -60,7 +60,7 @@ def test_uniform_generator_fills_the_unit_square() -> None:
 
 
 def test_clustered_generator_clusters() -> None:
-    """With spread 0 there are no more places than clusters, and neighbours are nearer than in the uniform case."""
+    """With spread 0 there are at most as many places as clusters, and neighbors are closer than in the uniform case."""
     drawn = ClusteredGenerator(n_tasks=30, n_clusters=3, spread=0.0)(4, np.random.default_rng(0))
     assert all(len(th.unique(tasks, dim=0)) <= 3 for tasks in drawn.tasks)
 
@@ -72,7 +72,7 @@ def test_clustered_generator_clusters() -> None:
 
 
 def test_fixed_generator_draws_whole_rows() -> None:
-    """Every drawn instance is one of the given ones, and over many draws each of them comes up."""
+    """Every drawn instance is one of the given ones, and all of them are drawn eventually."""
     given_ones = UniformGenerator(n_tasks=4)(5, np.random.default_rng(0))
     drawn = FixedGenerator(given_ones)(100, np.random.default_rng(1))
     same = (drawn.tasks[:, None] == given_ones.tasks).flatten(2).all(-1) & (drawn.depot[:, None] == given_ones.depot).all(-1)

@@ -1,4 +1,4 @@
-"""What the networks are told of distances, against plain Python."""
+"""Distances and related features of the networks, against plain Python."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def test_features_are_finite_for_instances_of_any_magnitude(instances: Instances
     assert features.isfinite().all()
 
 
-def test_scaled_instances_look_alike() -> None:
-    """Moved, and in another unit: the networks are told the same."""
+def test_scaled_instances_have_the_same_features() -> None:
+    """Moved, and in another unit: the features are the same."""
     instances = UniformGenerator(9, 2)(4, np.random.default_rng(0))
     moved = Instances.from_arrays(7 + 3 * instances.depot.numpy(), 7 + 3 * instances.tasks.numpy(), max_distance=6.0, n_uavs=2)
     for one, two in zip(FleetGeometry.of(static_of(instances)), FleetGeometry.of(static_of(moved)), strict=True):

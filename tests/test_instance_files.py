@@ -17,7 +17,7 @@ from instance_helpers import arrays, assert_equal, poked
 
 from sb3_uav.envs import Instances
 
-# Hypothesis may reuse one folder for all examples: every example writes its file anew.
+# Hypothesis may reuse one folder for all examples, as every example overwrites the file.
 SHARED_FOLDER = [HealthCheck.function_scoped_fixture]
 
 
@@ -75,6 +75,32 @@ def test_missing_file(tmp_path: Path) -> None:
         Instances.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("prize", "values"),
+        ("Prizes", "values"),
+        ("value", "values"),
+        ("reward", "values"),
+        ("vales", "values"),
+        ("D", "max_distance"),
+        ("max-dist", "max_distance"),
+        ("maxdistance", "max_distance"),
+        ("num_uavs", "n_uavs"),
+        ("mask", "task_mask"),
+        ("customers", "tasks"),
+        ("depots", "depot"),
+        ("comment", None),
+    ],
+)
+def test_unknown_arrays_are_refused_with_the_name_that_was_meant(name: str, meant: str | None, tmp_path: Path) -> None:
+    """Before, values under another name were silently ignored."""
+    np.savez(tmp_path / "plan.npz", **arrays(**{name: np.ones((2, 3))}))
+    advice = f"did you mean '{meant}'" if meant else "remove it; the known ones are depot, tasks, values"
+    with pytest.raises(ValueError, match=rf"plan\.npz: unknown array '{name}'; {advice}"):
+        Instances.load(tmp_path / "plan.npz")
+
+
 class Boobytrap:
     """Leaves a file behind when it is unpickled."""
 
@@ -87,10 +113,12 @@ class Boobytrap:
 
 @pytest.mark.parametrize("name", ["values", "notes"])
 def test_pickles_are_refused_and_not_run(name: str, tmp_path: Path) -> None:
-    """Neither in a field of ours nor in any other array of the file."""
+    """Neither in a known array nor in any other."""
     trap = np.array([Boobytrap(tmp_path / "sprung")], dtype=object)
     np.savez(tmp_path / "trap.npz", **arrays(**{name: trap}))
-    with pytest.raises(ValueError, match=r"trap\.npz: not an intact \.npz of plain arrays \(Object arrays cannot be loaded"):
+    with pytest.raises(
+        ValueError, match=rf"trap\.npz: not an intact \.npz of plain arrays \(array '{name}': Object arrays cannot be loaded"
+    ):
         Instances.load(tmp_path / "trap.npz")
     assert not (tmp_path / "sprung").exists()
 
@@ -109,7 +137,7 @@ def test_a_single_array_is_refused(tmp_path: Path) -> None:
 
 
 def test_truncated_files_are_refused(tmp_path: Path) -> None:
-    """Whatever part is missing at the end."""
+    """For any number of missing bytes at the end."""
     path = tmp_path / "cut.npz"
     Instances.from_arrays(**arrays()).save(path)
     content = path.read_bytes()
@@ -122,7 +150,7 @@ def test_truncated_files_are_refused(tmp_path: Path) -> None:
 @settings(max_examples=200, suppress_health_check=SHARED_FOLDER)
 @given(position=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
 def test_damaged_files_are_refused_or_harmless(position: float, flip: int, tmp_path: Path) -> None:
-    """One changed byte anywhere: a clear error, or, where zip keeps what nobody reads, the same numbers."""
+    """One changed byte anywhere: a clear error, or the same numbers if it is a byte that is not read."""
     instances = Instances.from_arrays(**arrays())
     instances.save(tmp_path / "damaged.npz")
     content = bytearray((tmp_path / "damaged.npz").read_bytes())
@@ -135,7 +163,7 @@ def test_damaged_files_are_refused_or_harmless(position: float, flip: int, tmp_p
         except ValueError as error:
             assert "damaged.npz: " in str(error)
         else:
-            # zipfile does not count entries: one may hide in the comment of another, and optional arrays may so be missing.
+            # zipfile does not count entries: one may become part of another's comment, so optional arrays may be missing.
             for name in ("depot", "tasks", "max_distance"):
                 assert th.equal(getattr(found, name), getattr(instances, name))
             assert found.n_uavs == instances.n_uavs
@@ -144,7 +172,7 @@ def test_damaged_files_are_refused_or_harmless(position: float, flip: int, tmp_p
 
 
 def test_failed_write_leaves_the_old_file(tmp_path: Path, small: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk runs full in the middle: the old file is whole, and no temporary file stays."""
+    """If the disk fills up during a write, the old file stays intact and no temporary file remains."""
     path = tmp_path / "plan.npz"
     small.save(path)
 
@@ -160,7 +188,7 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, small: Instances, monk
 
 
 def test_save_replaces_the_file_at_once(tmp_path: Path, small: Instances) -> None:
-    """Who has the old file open reads it to its end, and not a mixture."""
+    """A reader that has the old file open reads it to its end, without parts of the new one."""
     path = tmp_path / "plan.npz"
     small.save(path)
     before = path.read_bytes()

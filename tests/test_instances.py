@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instance_helpers import arrays, assert_equal, poked
 
-from sb3_uav.envs import Instances, UniformGenerator
+from sb3_uav.envs import Instances, RoutePlanningEnv, Schedule, UniformGenerator, check_schedule, nearest_feasible, plan_tours
 from sb3_uav.envs.instances import TENSOR_FIELDS
 from sb3_uav.training.fixed_set_returns import fingerprint
 
@@ -36,11 +37,11 @@ from sb3_uav.training.fixed_set_returns import fingerprint
         ({"n_uavs": 0}, "field 'n_uavs' is 0, but a fleet has a whole number of UAVs, at least 1"),
         ({"n_uavs": 2.5}, r"field 'n_uavs' is 2\.5, but a fleet has a whole number"),
         ({"n_uavs": np.nan}, "field 'n_uavs' is nan, but a fleet has a whole number"),
-        ({"n_uavs": [4, 6]}, "field 'n_uavs' mixes 4, 6; store each fleet size in a file of its own"),
+        ({"n_uavs": [4, 6]}, "field 'n_uavs' mixes 4, 6; store each fleet size in a separate file"),
         ({"n_uavs": [4, 4, 4]}, r"field 'n_uavs' has shape \(3,\), expected \(2,\)"),
         ({"n_uavs": None}, "field 'n_uavs' must be an array of real numbers, found None"),
         ({"task_mask": [[False, True, True], [True, True, True]]}, "marks a real task after a padded one; put the padding at"),
-        ({"task_mask": [[1, 2, 0], [1, 1, 1]]}, "field 'task_mask' holds other things than True and False"),
+        ({"task_mask": [[1, 2, 0], [1, 1, 1]]}, "field 'task_mask' holds values other than True and False"),
         ({"task_mask": np.ones((2, 4))}, r"task_mask has shape \(2, 4\), expected \(2, 3\)"),
         ({"depot": np.zeros((3, 2))}, r"depot has shape \(3, 2\), expected \(2, 2\)"),
         ({"depot": np.zeros(2)}, r"depot has shape \(2,\), expected \(2, 2\)"),
@@ -77,8 +78,38 @@ def test_from_arrays_fills_in_the_rest() -> None:
     assert many.max_distance.tolist() == [5.0, 5.0]
 
 
+@pytest.mark.parametrize("name", ["depot", "tasks", "values", "max_distance", "task_mask"])
+def test_masked_arrays_are_refused(name: str) -> None:
+    """A masked entry is not a number; an array without masked entries is accepted."""
+    masked = np.ma.array(arrays()[name])
+    assert_equal(Instances.from_arrays(**arrays(**{name: masked})), Instances.from_arrays(**arrays()))
+    masked[1] = np.ma.masked
+    for given_array in (masked, list(masked)):
+        with pytest.raises(
+            ValueError, match=rf"field '{name}' has masked entries, the first at index \(1,.*; fill them or leave"
+        ):
+            Instances.from_arrays(**arrays(**{name: given_array}))
+
+
+@pytest.mark.parametrize("dtype", [th.float64, th.float32, th.bfloat16])
+def test_tensors_with_gradients_are_taken_as_numbers(dtype: th.dtype) -> None:
+    """Without their graph, in float64, and as a copy."""
+    tasks = th.tensor([[0.5, 0.25], [1.0, 2.0]], dtype=dtype, requires_grad=True)
+    instances = Instances.from_arrays(th.zeros(2), tasks, max_distance=th.tensor(5.0, requires_grad=True))
+    assert instances.tasks.tolist() == [tasks.tolist()] and instances.tasks.dtype == th.float64
+    assert not instances.tasks.requires_grad and instances.max_distance.tolist() == [5.0]
+    with pytest.raises(ValueError, match="field 'depot' must be an array of real numbers: "):
+        Instances.from_arrays([tasks[0, 0], tasks[0, 1]], tasks)
+
+
+def test_instances_with_gradients_are_saved(small: Instances, tmp_path: Path) -> None:
+    replace(small, tasks=small.tasks.clone().requires_grad_()).save(tmp_path / "small.npz")
+    assert_equal(Instances.load(tmp_path / "small.npz"), small)
+    assert replace(small, tasks=small.tasks.clone().requires_grad_()).digest() == small.digest()
+
+
 def test_from_arrays_copies() -> None:
-    """Writing into the arrays afterwards, or into the instances, reaches neither."""
+    """Later writes to the arrays do not change the instances, and vice versa."""
     given_arrays = arrays()
     before = {name: np.copy(array) for name, array in given_arrays.items()}
     instances = Instances.from_arrays(**given_arrays)
@@ -114,6 +145,60 @@ def test_rows(small: Instances) -> None:
         assert_equal(small[indices], Instances.concatenate([small[2], small[0]]))
     assert_equal(small[th.tensor([True, False, True])], small[[0, 2]])
     assert_equal(small[np.array([True, False, True])], small[[0, 2]])
+
+
+@pytest.mark.parametrize(
+    "one", [th.tensor(1), th.tensor(-2), np.array(1), th.tensor(1, dtype=th.uint8), np.uint16(1), th.tensor([0, 1])[1]]
+)
+def test_a_number_without_dimensions_selects_a_batch_of_one(one: Any, small: Instances) -> None:
+    assert_equal(small[one], small[1:2])
+
+
+def test_rows_in_the_order_of_a_permutation(small: Instances) -> None:
+    """``for k in torch.randperm(n)``, as in training loops."""
+    order = th.randperm(3, generator=th.Generator().manual_seed(0))
+    rows = [small[k] for k in order]
+    assert [len(row) for row in rows] == [1, 1, 1]
+    assert_equal(Instances.concatenate(rows), small[order])
+
+
+def test_slices_may_run_backwards(small: Instances) -> None:
+    assert_equal(small[::-1], small[[2, 1, 0]])
+    assert_equal(small[:0:-1], small[[2, 1]])
+    assert_equal(small[th.tensor([2, 0], dtype=th.uint8)], small[[2, 0]])
+
+
+@pytest.mark.parametrize("nothing", [[], (), np.array([]), th.tensor([]), slice(0, 0), th.zeros(3, dtype=th.bool), range(0)])
+def test_an_empty_selection_is_an_empty_batch(nothing: Any, small: Instances, tmp_path: Path) -> None:
+    """It works where an empty result makes sense, and raises a clear error elsewhere."""
+    empty = small[nothing]
+    empty.validate()
+    assert (len(empty), empty.n_tasks, empty.n_uavs) == (0, 5, 2) and list(empty) == []  # type: ignore[call-overload]
+    assert_equal(Instances.concatenate([empty, small, empty]), small)
+    assert len(empty.pad(7).trim(3).near_origin()) == 0 and empty.reachable().shape == (0, 5)
+    assert nearest_feasible(empty).shape == (0, 1)
+    assert plan_tours(empty, th.zeros(0, 2, 5, dtype=th.int64), nearest_feasible).tours.shape == (0, 2, 2, 1)
+    assert empty.digest() != small.digest()
+    with pytest.raises(ValueError, match=r"empty\.npz: there are no instances to save; a file holds at least one"):
+        empty.save(tmp_path / "empty.npz")
+    with pytest.raises(IndexError, match="instance 0 of a batch of 0"):
+        check_schedule(empty, 0, Schedule([]))
+    with pytest.raises(IndexError, match="instance 0 of a batch of 0"):
+        empty[0]
+    with pytest.raises(ValueError, match="There are no instances to draw from; give at least one"):
+        RoutePlanningEnv(instances=empty)
+    assert not (tmp_path / "empty.npz").exists()
+
+
+def test_joining_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="There are no instances to join; give at least one batch"):
+        Instances.concatenate([])
+
+
+@pytest.mark.parametrize("bad", [True, 1.0, [0.0, 1.0], [[0, 1]], [True, False], th.tensor(True), np.zeros((1, 1), dtype=int)])
+def test_other_indices_are_refused(bad: Any, small: Instances) -> None:
+    with pytest.raises(IndexError, match="is not a selection of instances; use row numbers, or 3 bools"):
+        small[bad]
 
 
 def test_iteration_ends(small: Instances) -> None:
@@ -165,7 +250,7 @@ def test_to(small: Instances) -> None:
 
 
 def test_reachable() -> None:
-    """There and back within D, the border included; padded tasks never."""
+    """There and back within D, inclusive; padded tasks never are."""
     instances = Instances.from_arrays(
         depot=[0, 0], tasks=[[0.3, 0.4], [0.5, 0], [0.50001, 0], [0, 0]], max_distance=1.0, task_mask=[1, 1, 1, 0]
     )
@@ -174,7 +259,7 @@ def test_reachable() -> None:
 
 
 def test_digests_stay_as_result_files_store_them(small: Instances) -> None:
-    """Folders of results and zips hold them: another digest would refuse to resume."""
+    """Result folders and zips store them: with other digests, runs could not be resumed."""
     padded = small.pad(6)
     assert padded.digest() == "5041946ddb479bdcd8c81de0fbcb11b71e74f3f94983f89d4d1538fee057d250"
     assert fingerprint(padded, 3) == "ebed545e3f447bcc"

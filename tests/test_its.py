@@ -198,7 +198,7 @@ def test_router_of_another_algorithm(algo, monkeypatch):
     assert all(0 < record.objective <= N_TASKS and record.n_instances >= 8 for record in its.records)
 
 
-@pytest.mark.filterwarnings("error:This AllocatorPolicy wants the tasks")
+@pytest.mark.filterwarnings("error:This AllocatorPolicy expects the tasks")
 @pytest.mark.parametrize("algorithm", [PPO, MaskablePPO])
 def test_allocator_of_another_algorithm(algorithm):
     model = algorithm(

@@ -55,7 +55,7 @@ def reference_batch_norm(p: dict[str, np.ndarray], layer: int, name: str, x: np.
 
 
 def reference_encoder(encoder: AttentionEncoder, depot: np.ndarray, tasks: np.ndarray) -> np.ndarray:
-    """One instance through the encoder in plain numpy: paper, equations (11) to (15), batch norm in evaluation mode."""
+    """One instance through the encoder in plain numpy: paper, equations (10) to (14), batch norm in evaluation mode."""
     p = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
     nodes = np.vstack(
         [depot @ p["embed_depot.weight"].T + p["embed_depot.bias"], tasks @ p["embed_task.weight"].T + p["embed_task.bias"]]
@@ -81,7 +81,7 @@ def reference_encoder(encoder: AttentionEncoder, depot: np.ndarray, tasks: np.nd
 
 
 def test_paper_allocator_forward_pass_by_hand():
-    """Equations (11) to (19) in numpy, in the middle of an episode, agree with the policy's logits."""
+    """Equations (10) to (18) in numpy, in the middle of an episode, agree with the policy's logits."""
     policy = make_policy("allocator", preset="paper", n_uavs=2, n_tasks=4)
     shake_statistics(policy)
     instance = draw(1, 4, 2)

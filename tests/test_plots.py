@@ -14,7 +14,7 @@ import pytest
 
 from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator
-from sb3_uav.envs.render import UAV_COLOURS
+from sb3_uav.envs.render import UAV_COLORS
 from sb3_uav.plots import MapPanel, learning_curves, plot_learning_curves, plot_schedule, plot_schedules
 from sb3_uav.plots.learning_curves import read_its_log
 from sb3_uav.plots.schedule_map import schedules_figure
@@ -61,8 +61,8 @@ def test_map_of_a_schedule(instances: Instances, tmp_path: Path) -> None:
     path = only_file_in(tmp_path / "new")
     height, width = matplotlib.image.imread(path).shape[:2]
     assert width > 600 and height > 700
-    assert set(UAV_COLOURS[:2]) <= colours_in(path)
-    assert UAV_COLOURS[2] not in colours_in(path)
+    assert set(UAV_COLORS[:2]) <= colours_in(path)
+    assert UAV_COLORS[2] not in colours_in(path)
 
 
 def test_legend_and_extent_of_a_map(instances: Instances) -> None:
@@ -75,7 +75,7 @@ def test_legend_and_extent_of_a_map(instances: Instances) -> None:
         f"UAV 1: 3 tasks, length {length:.2f}",
         f"UAV 2: 1 task, length {single:.2f}",
         "UAV 3: 0 tasks, length 0.00",
-        "depot",
+        "depot (D = 2.00)",
         "8 tasks skipped",
     ]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == expected

@@ -1,6 +1,8 @@
 """Every way to use a network computes the same, and masked actions are never chosen."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,6 +189,46 @@ def test_action_masks_argument_overrides_the_observation(level):
     mask[:, 1] = True
     for actions in (policy(tensor, action_masks=mask)[0], policy._predict(tensor, action_masks=mask)):
         assert (actions == 1).all()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_without_action_masks_the_mask_of_the_observation_counts(level):
+    """With action_masks=None, as EvalCallback, evaluate_policy and enjoy call a MaskablePPO's policy."""
+    policy, env = make_policy(level), make_vec(level, 2)
+    observation = env.reset()
+    observation["action_mask"][:] = 0
+    observation["action_mask"][:, 2] = 1
+    tensor = obs_as_tensor(observation, th.device("cpu"))
+    assert (policy.predict(observation, action_masks=None)[0] == 2).all()
+    assert (policy(tensor, action_masks=None)[0] == 2).all()
+    assert (policy.get_distribution(tensor, None).distribution.probs[:, 2] == 1).all()
+    _, log_prob, entropy = policy.evaluate_actions(tensor, th.tensor([2, 2]), None)
+    assert log_prob.tolist() == [0.0, 0.0] and entropy.tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("argument", [False, True])
+def test_a_row_without_legal_actions_is_an_error(level, argument):
+    """Not an arbitrary action: through every entry point, from the observation or from action_masks."""
+    policy, env = make_policy(level), make_vec(level, 4)
+    observation, masks = env.reset(), env.action_masks()
+    (masks if argument else observation["action_mask"])[2:] = 0
+    kwargs: dict[str, Any] = dict(action_masks=masks) if argument else {}
+    tensor = obs_as_tensor(observation, th.device("cpu"))
+    source = "^action_masks" if argument else r'^observation\["action_mask"\]'
+    message = rf"{source} allows no action in row 2 \(2 of 4 rows\); set at least one entry of each row to 1"
+    calls: list[Callable[[], Any]] = [
+        lambda: policy.predict(observation, deterministic=True, **kwargs),
+        lambda: policy(tensor, **kwargs),
+        lambda: policy.get_distribution(tensor, **kwargs),
+        lambda: policy.evaluate_actions(tensor, th.zeros(4), **kwargs),
+    ]
+    for call in calls:
+        for gradients in (False, True):
+            with th.set_grad_enabled(gradients), pytest.raises(ValueError, match=message):
+                call()
+    # The value of an observation needs no action.
+    assert policy.predict_values(tensor).isfinite().all()
 
 
 @pytest.mark.parametrize("level", LEVELS)

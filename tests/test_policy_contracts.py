@@ -65,7 +65,7 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         assert th.equal(value, loaded.state_dict()[name])
 
 
-def test_relative_attention_knows_exact_positions_in_mixed_precision():
+def test_relative_attention_compares_exact_positions_in_mixed_precision():
     """In bfloat16 some of these positions would be the same."""
     th.manual_seed(0)
     attention = SelfAttention(8, 2, relative=True)
@@ -76,7 +76,7 @@ def test_relative_attention_knows_exact_positions_in_mixed_precision():
     exact = attention(nodes, None, coordinates)
     with th.autocast("cpu", th.bfloat16):
         mixed = attention(nodes, None, coordinates)
-    # Every node looks at itself alone, so that the five results differ as much as the nodes do.
+    # Every node attends to itself alone, so the five results differ as much as the nodes do.
     assert (exact - attention.project_out(attention.project_in(nodes)[..., 16:])).abs().max() < 0.05
     assert (mixed - exact).abs().max() < 0.02 < exact.std(dim=1).min()
 
@@ -100,7 +100,7 @@ def test_mixed_precision_changes_little(level):
 
 
 @pytest.mark.parametrize("task_order, sweep, warned", [("input", True, 1), ("input", False, 0), ("sweep", True, 0)])
-def test_tasks_in_an_unwanted_order_are_pointed_out_once(task_order, sweep, warned):
+def test_tasks_in_another_order_than_the_policys_are_reported_once(task_order, sweep, warned):
     policy: Any = AllocatorPolicy
     env: Any = BatchedVecEnv([lambda: TaskAllocationEnv(12, 3, task_order=task_order)] * 4)
     model = PPO(policy, env, n_steps=4, batch_size=8, n_epochs=1, policy_kwargs={**SMALL, "sweep": sweep}, device="cpu")
@@ -108,7 +108,7 @@ def test_tasks_in_an_unwanted_order_are_pointed_out_once(task_order, sweep, warn
         warnings.simplefilter("always")
         model.learn(32)
         model.predict(env.reset())
-    assert sum("wants the tasks in the order of a sweep" in str(warning.message) for warning in caught) == warned
+    assert sum("expects the tasks in the order of a sweep" in str(warning.message) for warning in caught) == warned
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -1,5 +1,7 @@
 """What REINFORCE learns, its gradient and its baselines."""
 
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from sb3_uav.envs import (
     collected_value,
     nearest_feasible,
 )
+from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce import REINFORCE
 
 # ------------------------------------------------------------------------------------------ learning
@@ -72,32 +75,154 @@ def test_allocator_learns_to_split():
     assert objective() > max(untrained, random_split) + 0.25
 
 
+# ------------------------------------------------------------------------------------------ epochs
+
+
+@pytest.mark.parametrize("baseline", ["exponential", "rollout"])
+def test_every_epoch_that_a_batch_completes_is_closed(baseline):
+    """640 instances at 20 an epoch are 32 epochs, whether or not a batch holds several."""
+    model = make_model(baseline=baseline, env=make_env(n_envs=64), instances_per_epoch=20, lr_decay=0.9, learning_rate=0.01)
+    model.learn_instances(64)
+    assert model.epoch == 3
+    model.learn_instances(64)
+    assert model.epoch == 6
+    # The second batch was learned at the rate of the epoch in which it began.
+    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(0.01 * 0.9**3)
+    model.learn_instances(640 - 128)
+    assert model.epoch == 32
+
+
+def test_the_baseline_is_tested_once_per_update_as_at_the_end_of_its_last_epoch(monkeypatch):
+    model = make_model(baseline="rollout", env=make_env(n_envs=64), instances_per_epoch=20)
+    tested = []
+    monkeypatch.setattr(model._baseline, "end_epoch", lambda problem: tested.append(model.epoch))
+    for _ in range(3):
+        model.learn_instances(64)
+    # 64, 128 and 192 instances complete 3, 6 and 9 epochs; the epochs count from 0.
+    assert tested == [2, 5, 8] and model.epoch == 9
+
+
 # ------------------------------------------------------------------------------------------ the gradient
 
 
+class GradientByHand(BaseCallback):
+    """The gradient of a loss that is computed from the episodes of the last update, for one layer."""
+
+    def __init__(self, loss: Callable[[Any, Any], th.Tensor]) -> None:
+        super().__init__()
+        self.loss = loss
+        self.gradient: Any = None
+
+    def _on_rollout_end(self) -> None:
+        algorithm: Any = self.model
+        batch = algorithm._batch
+        evaluation = algorithm.policy.evaluate_episodes(batch.instances, batch.actions)
+        self.gradient = th.autograd.grad(self.loss(batch, evaluation), watched(algorithm))[0]
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def watched(model: Any) -> th.nn.Parameter:
+    extractor = model.policy.features_extractor
+    return extractor.scorer.score.weight if isinstance(model.policy, AllocatorPolicy) else extractor.encoder.embed_task.weight
+
+
+def assert_gradient(model: Any, by_hand: GradientByHand) -> None:
+    assert by_hand.gradient.abs().max() > 1e-3
+    th.testing.assert_close(watched(model).grad, by_hand.gradient, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("baseline", ["none", "exponential", "shared", "rollout"])
-def test_loss_is_the_papers(baseline):
-    """mean((baseline - return) * sum of log-probabilities), by hand on one batch."""
-    model = make_model(baseline=baseline)
-    gradients = {}
+def test_loss_is_the_papers(baseline, normalize):
+    """mean((baseline - return) * sum of log-probabilities), by hand on one batch; normalized by the standard deviation."""
 
-    class Spy(BaseCallback):
-        def _on_rollout_end(self) -> None:
-            algorithm: Any = self.model
-            batch = algorithm._batch
-            evaluation = algorithm.policy.evaluate_episodes(batch.instances, batch.actions)
-            mean = {"none": 0.0, "shared": batch.returns.mean(1, keepdim=True)}.get(baseline, batch.returns.mean())
-            loss = ((mean - batch.returns).float() * evaluation.log_prob.sum(-1)).mean()
-            gradients["expected"] = th.autograd.grad(loss, algorithm.policy.features_extractor.scorer.score.weight)[0]
+    def loss(batch: Any, evaluation: Any) -> th.Tensor:
+        mean = {"none": 0.0, "shared": batch.returns.mean(1, keepdim=True)}.get(baseline, batch.returns.mean())
+        costs = (mean - batch.returns).float()
+        costs = costs / costs.std() if normalize else costs
+        return (costs * evaluation.log_prob.sum(-1)).mean()
 
-        def _on_step(self) -> bool:
-            return True
+    by_hand = GradientByHand(loss)
+    model = make_model(baseline=baseline, normalize_advantage=normalize, max_grad_norm=1e9).learn_instances(4, by_hand)
+    assert_gradient(model, by_hand)
 
-    model.max_grad_norm = 1e9
-    model.learn_instances(4, Spy())
-    th.testing.assert_close(
-        model.policy.features_extractor.scorer.score.weight.grad, gradients["expected"], atol=1e-5, rtol=1e-4
-    )
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_critics_loss_weighs_every_step_by_its_own_advantage(normalize):
+    """Rewards to go minus values, over the steps before the end of each episode only."""
+    found = {}
+
+    def loss(batch: Any, evaluation: Any) -> th.Tensor:
+        total, advantages, terms = 0.0, [], []
+        for row, sample in np.ndindex(*batch.returns.shape):
+            actions = batch.actions[row, sample].tolist()
+            # The tour is over when it is back at the depot.
+            n_steps = actions.index(0) + 1
+            rewards = [float(batch.instances.values[row, action - 1]) if action > 0 else 0.0 for action in actions[:n_steps]]
+            for step in range(n_steps):
+                advantages.append(sum(rewards[step:]) - evaluation.values[row, sample, step].item())
+                terms.append(evaluation.log_prob[row, sample, step])
+        found["n_steps"] = len(terms)
+        scale = float(np.std(advantages, ddof=1)) if normalize else 1.0
+        for advantage, term in zip(advantages, terms, strict=True):
+            total = total - advantage / scale * term
+        return total / batch.returns.numel()
+
+    by_hand = GradientByHand(loss)
+    kwargs: dict[str, Any] = dict(normalize_advantage=normalize, max_grad_norm=1e9, vf_coef=0.0)
+    model = make_model("router", "critic", **kwargs).learn_instances(4, by_hand)
+    assert found["n_steps"] < 4 * 3 * 7, "no episode ended before the last step"
+    assert_gradient(model, by_hand)
+
+
+def flat_parameters(model: REINFORCE) -> th.Tensor:
+    return th.cat([parameter.detach().flatten().clone() for parameter in model.policy.parameters()])
+
+
+@pytest.mark.parametrize("limit", [1e-3, 1e9])
+def test_max_grad_norm_limits_the_update(limit):
+    """With plain gradient descent and a learning rate of 1, an update is as long as its gradient, clipped."""
+    network = dict(SMALL, optimizer_class=th.optim.SGD)
+    model = make_model(max_grad_norm=limit, learning_rate=1.0, policy_kwargs=network)
+    before = flat_parameters(model)
+    model.learn_instances(4)
+    gradient_norm = model.logger.name_to_value["train/grad_norm"]
+    assert gradient_norm > 0.01
+    length = (flat_parameters(model).double() - before).norm().item()
+    assert length == pytest.approx(min(gradient_norm, limit), rel=0.02)
+
+
+class MeanEntropy(BaseCallback):
+    """The entropy that the training reports of every update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values: list[float] = []
+
+    def _on_rollout_start(self) -> None:
+        if "train/entropy_loss" in self.logger.name_to_value:
+            self.values.append(-self.logger.name_to_value["train/entropy_loss"])
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_positive_ent_coef_favors_entropy(fused):
+    changes = []
+    for ent_coef in (30.0, -30.0):
+        recorder = MeanEntropy()
+        if fused:
+            kwargs: dict[str, Any] = dict(ent_coef=ent_coef, learning_rate=3e-3, policy_kwargs={**SMALL, "geometry": False})
+            make_model(**kwargs).learn_instances(4 * 15, recorder, log_interval=100)
+        else:
+            env = make_vec_env("CartPole-v1", 2, seed=0)
+            model = REINFORCE("MlpPolicy", env, 1e-2, n_steps=64, ent_coef=ent_coef, seed=0, device="cpu")
+            model.learn(2 * 64 * 15, recorder, log_interval=100)
+        changes.append(recorder.values[-1] - recorder.values[0])
+    assert changes[0] > changes[1] + 0.05
 
 
 def test_shared_baseline_is_the_mean_of_the_samples():
@@ -163,3 +288,58 @@ def test_critic_predicts_the_reward_to_go():
     model = make_model("router", "critic", make_env("router", 32), learning_rate=5e-3, n_samples=1)
     model.learn_instances(32 * 60)
     assert model.logger.name_to_value["train/explained_variance"] > 0.4
+
+
+# ------------------------------------------------------------------------------------------ numbers that are not finite
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize(("bad", "name"), [(math.nan, "loss"), (math.inf, "loss"), (math.nan, "gradient norm")])
+def test_a_loss_or_gradient_that_is_not_finite_stops_before_the_update(fused, bad, name, monkeypatch):
+    """The parameters stay as they were, hence finite."""
+    model: Any = make_model() if fused else REINFORCE("MlpPolicy", "CartPole-v1", n_steps=32, seed=0, device="cpu")
+    learn = (lambda: model.learn_instances(4)) if fused else lambda: model.learn(32, reset_num_timesteps=False)
+    learn()
+    before = flat_parameters(model)
+    if name == "loss":
+        monkeypatch.setattr(model, "_total_loss", lambda *args: bad * sum(p.sum() for p in model.policy.parameters()))
+    else:
+        next(model.policy.parameters()).register_hook(lambda gradient: gradient * bad)
+    with pytest.raises(ValueError, match=rf"The {name} is (nan|-?inf) in update 2, after \d+ steps; .*smaller learning_rate"):
+        learn()
+    assert th.equal(flat_parameters(model), before) and th.isfinite(before).all()
+    assert model._n_updates == 1
+
+
+def test_a_learning_rate_that_is_far_too_large_stops_with_an_error():
+    model = make_model("router", learning_rate=1e30)
+    with pytest.raises(ValueError, match="is nan in update"):
+        model.learn_instances(400)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
+# ------------------------------------------------------------------------------------------ PyTorch's defaults
+
+
+@pytest.fixture
+def other_default(request: pytest.FixtureRequest) -> Iterator[None]:
+    """``float64``, or the device ``meta``, on which every use of a tensor that should be on the CPU fails."""
+    if request.param == "float64":
+        th.set_default_dtype(th.float64)
+    else:
+        th.set_default_device(request.param)
+    yield
+    th.set_default_dtype(th.float32)
+    th.set_default_device("cpu")
+
+
+@pytest.mark.parametrize("other_default", ["float64", "meta"], indirect=True)
+@pytest.mark.parametrize("baseline", BASELINES)
+@pytest.mark.parametrize("level", ["allocator", "router"])
+def test_pytorchs_default_dtype_and_device_do_not_matter(level, baseline, other_default):
+    with th.device("cpu"):
+        model = make_model(level, baseline)
+    model.learn_instances(12)
+    assert model.epoch == 1 and model.n_batches == 3
+    assert all(parameter.dtype == th.float32 for parameter in model.policy.parameters())
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())

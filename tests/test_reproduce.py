@@ -22,9 +22,9 @@ from PIL import Image
 from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
-from sb3_uav.studies.reproduce.pairs import ITS, Models
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
+from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
     LARGER_METHODS,
@@ -34,9 +34,11 @@ from sb3_uav.studies.reproduce.paper import (
     SIZES,
     paper_figure,
 )
-from sb3_uav.studies.reproduce.scales import SMOKE, Scenario, scenarios
-from sb3_uav.studies.reproduce.targets import TARGETS
-from sb3_uav.studies.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.reproduce.scales import SMOKE, Scenario, scenarios
+from sb3_uav.reproduce.targets import TARGETS
+from sb3_uav.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 pytest.importorskip("rl_zoo3")
 
@@ -218,6 +220,17 @@ def test_curves_of_every_epoch(name: str, n_trainings: int, out: Path) -> None:
 
 
 @pytest.mark.slow
+def test_routers_of_both_strategies_have_as_many_epochs(out: Path) -> None:
+    """DL-DRL-I trains its router as long as DL-DRL, before the allocator's first epoch."""
+    phases = {}
+    for strategy in ("ITS", "independent"):
+        with (out / f"models/U4-N80/{strategy}/its_log.csv").open() as file:
+            phases[strategy] = [row["phase"] for row in csv.DictReader(file) if row["level"] == "router"]
+    assert len(phases["ITS"]) == len(phases["independent"]) == 1 + 2 + 2
+    assert set(phases["independent"]) == {"pre-training"} != set(phases["ITS"])
+
+
+@pytest.mark.slow
 def test_fig5_leaves_out_what_it_says(out: Path) -> None:
     _, rows, _ = read_table(out / "fig5_curves.csv")
     phases: dict[str, set[str]] = {}
@@ -271,10 +284,10 @@ def test_own_pairs(out: Path, tmp_path: Path, threads: None, capsys: pytest.Capt
     _, rows, comments = read_table(results / "fig3.csv")
     situations = [row["Situation"] for row in rows]
     assert situations == ["U4-80", "U4-100", *(scenario.name for scenario in scenarios() if scenario.n_uavs == 6)]
-    assert any("There is no pair for U4-500, and --no-training forbids to train one" in comment for comment in comments)
+    assert any("There is no pair for U4-500, and --no-training forbids training one" in comment for comment in comments)
     _, rows, comments = read_table(results / "fig7.csv")
     assert [row["Method"] for row in rows] == ["U6"]
-    assert any("K-means+VND was not asked for" in comment for comment in comments)
+    assert any("K-means+VND was not requested" in comment for comment in comments)
     assert not (results / "models").exists() and "training 1" not in capsys.readouterr().err
     (models / "U4-N80/ITS/router.zip").unlink()
     assert run("fig3", "--scale", "smoke", "--models", models, "--no-training", "--out", results) == 2
@@ -288,7 +301,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def no_licence(spec: str, **_: Any) -> Any:
         raise ValueError(f"{spec}: no licence")
 
-    monkeypatch.setattr("sb3_uav.studies.reproduce.evaluator.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.reproduce.evaluator.make_solver", no_licence)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")
@@ -306,17 +319,14 @@ def job(folder: Path, strategy: str = ITS, **its: Any) -> PairTraining:
 @pytest.mark.slow
 def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: None) -> None:
     """With the same result as if it had not been interrupted."""
-    from sb3_uav.training import ITSCallback
 
-    end_epoch = ITSCallback._end_epoch
-
-    def interrupted(self: ITSCallback) -> None:
-        end_epoch(self)
-        if self.epoch == 2:
+    def interrupted(folder: Path, *args: Any) -> None:
+        write_checkpoint(folder, *args)
+        if read_state(folder)["epoch"] == 2:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ITSCallback, "_end_epoch", interrupted)
+        patch.setattr("sb3_uav.training.its.write_checkpoint", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train_pair(job(tmp_path))
     assert not (tmp_path / "models").exists()
@@ -324,21 +334,21 @@ def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch:
         train_pair(job(tmp_path, n_epochs=5))
     train_pair(job(tmp_path))
     for name in ("allocator.zip", "router.zip"):
-        resumed, unbroken = load_policy(tmp_path / "models/ITS" / name), load_policy(out / "models/U4-N80/ITS" / name)
+        resumed, unbroken = load_policy(tmp_path / "models/its" / name), load_policy(out / "models/U4-N80/ITS" / name)
         assert all(th.equal(value, resumed.state_dict()[key]) for key, value in unbroken.state_dict().items()), name
     columns = ("epoch", "level", "phase", "n_instances", "objective")
     logs = []
-    for path in (tmp_path / "models/ITS/its_log.csv", out / "models/U4-N80/ITS/its_log.csv"):
+    for path in (tmp_path / "models/its/its_log.csv", out / "models/U4-N80/ITS/its_log.csv"):
         with path.open() as file:
             logs.append([[row[column] for column in columns] for row in csv.DictReader(file)])
     assert logs[0] == logs[1]
-    about = json.loads((tmp_path / "models/ITS/training.json").read_text())
+    about = json.loads((tmp_path / "models/its/training.json").read_text())
     assert about["strategy"] == ITS and about["seed"] == 0 and "torch" in about["versions"]
 
 
 @pytest.mark.slow
 def test_trainings_in_parallel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    jobs = [job(tmp_path / str(index), strategy, n_epochs=1) for index, strategy in enumerate((ITS, "independent"))]
+    jobs = [job(tmp_path / str(index), strategy, n_epochs=1) for index, strategy in enumerate((ITS, INDEPENDENT))]
     train_pairs(jobs, 2)
     assert all((j.model_folder / "allocator.zip").is_file() and (j.model_folder / "its_log.csv").is_file() for j in jobs)
     assert "2 trainings, 2 at once: U4-80, independent: allocator epoch 1 of 1" in capsys.readouterr().err
@@ -348,7 +358,7 @@ def test_trainings_in_parallel(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_a_failed_training_says_where_to_look(tmp_path: Path) -> None:
     broken = job(tmp_path)
     broken.entry["learning_rat"] = 1.0
-    with pytest.raises(TrainingError, match=r"Training U4-80, ITS failed: .*did you mean 'learning_rate'.*output\.txt"):
+    with pytest.raises(TrainingError, match=r"Training U4-80, its failed: .*did you mean 'learning_rate'.*output\.txt"):
         train_pair(broken)
 
 
@@ -364,7 +374,7 @@ def test_a_failed_process_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(TrainingError, match=r"failed: .*did you mean 'learning_rate'"):
         TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
     sender.close()
-    with pytest.raises(TrainingError, match="U4-80, ITS failed: its process died; was it out of memory"):
+    with pytest.raises(TrainingError, match="U4-80, its failed: its process died; was it out of memory"):
         TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
 
 
@@ -383,7 +393,7 @@ def test_pairs_of_other_settings_are_not_used(out: Path, tmp_path: Path) -> None
     [
         (["table1", "--models", "nowhere"], "--models nowhere: no such folder; give one that holds U4-N80/ITS/allocator.zip"),
         (["table1", "--solvers", "gurobi"], "--solvers: 'gurobi' is not one of ["),
-        (["table1", "--solvers", "dl-drl"], "trained pairs are always there"),
+        (["table1", "--solvers", "dl-drl"], "trained pairs are always included"),
         (["table1", "--solvers", "kmeans-am", "kmeans-am"], "names 'kmeans-am' twice"),
         (["table1", "--jobs", "0"], "--jobs is 0; it must be at least 1"),
         (["table1", "--seed", "-1"], "--seed is -1; it must be at least 0"),

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import platform
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +15,24 @@ import pytest
 import torch as th
 from its_logs import LOG
 
+from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
-from sb3_uav.studies.reproduce import paper
-from sb3_uav.studies.reproduce.evaluator import Evaluator
-from sb3_uav.studies.reproduce.figures_3_to_7 import read_curves
-from sb3_uav.studies.reproduce.pair_training import training_entry
-from sb3_uav.studies.reproduce.pairs import ITS, Model
-from sb3_uav.studies.reproduce.paper import paper_figure, paper_tables
-from sb3_uav.studies.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scenario, scenarios
-from sb3_uav.studies.reproduce.table_formats import Column, Table, best, to_csv, to_latex, to_markdown
-from sb3_uav.studies.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.reproduce import paper
+from sb3_uav.reproduce.evaluator import Evaluator
+from sb3_uav.reproduce.figures_3_to_7 import read_logged_curves
+from sb3_uav.reproduce.origin import Origin
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
+from sb3_uav.reproduce.pairs import Model
+from sb3_uav.reproduce.paper import paper_figure, paper_tables
+from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario, scenarios
+from sb3_uav.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
+from sb3_uav.reproduce.table_layout import best, lay_out
+from sb3_uav.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS, NO_INTENSIVE
 
 pytest.importorskip("rl_zoo3")
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results" / "reproduce"
 
 
 # ------------------------------------------------------------------------------------------------------- the paper's figures
@@ -110,11 +120,46 @@ def test_training_entries() -> None:
     assert (entry["n_envs"], entry["instances_per_epoch"], entry["learning_rate"]) == (256, 1_280_000, 1e-4)
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
     assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
-    cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), "ITS/intensive")
+    cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), NO_INTENSIVE)
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (cpu["instances_per_epoch"], cpu["baseline"], its["router"]["baseline"]) == (320, "shared", "shared")
-    assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("ITS/intensive", 24, 8)
+    assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("no-intensive", 24, 8)
     assert training_entry(SMOKE, SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
+
+
+def training(scale: Scale, scenario: Scenario, strategy: str) -> PairTraining:
+    entry = training_entry(scale, scale.recipe, scenario, strategy)
+    return PairTraining(scenario, strategy, entry, Path("runs"), Path("models"), 0, "cpu", 1)
+
+
+@pytest.mark.parametrize("scale", SCALES.values(), ids=str)
+def test_the_independent_router_is_trained_as_long_as_that_of_its(scale: Scale) -> None:
+    """The fault: only in the epochs of pre-training, so that DL-DRL-I and K-means+AM had a router of five epochs."""
+    for scenario in scenarios():
+        independent, its = (training(scale, scenario, strategy).schedule for strategy in (INDEPENDENT, ITS))
+        assert independent.n_router_epochs == independent.n_pretraining_epochs == its.n_router_epochs
+        assert its.n_router_epochs > its.n_pretraining_epochs and independent.n_epochs == its.n_epochs
+    assert training(PAPER, Scenario(4, 80), INDEPENDENT).schedule.n_router_epochs == 5 + 8 + 92
+
+
+def test_pairs_of_earlier_versions(tmp_path: Path) -> None:
+    """The paper's names of the strategies mean the same; routers of DL-DRL-I that were trained too briefly are not used."""
+    for strategy, old_name, fits in ((NO_INTENSIVE, "ITS/intensive", True), (INDEPENDENT, "independent", False)):
+        job = replace(training(SMOKE, Scenario(4, 80), strategy), model_folder=tmp_path / strategy)
+        entry = json.loads(json.dumps(job.entry))
+        entry["callback"][0]["sb3_uav.training.ITSCallback"]["strategy"] = old_name
+        job.model_folder.mkdir()
+        (job.model_folder / "training.json").write_text(json.dumps({"seed": 0, "entry": entry}))
+        if fits:
+            assert check_complete(job)
+        else:
+            with pytest.raises(TrainingError, match="was trained with other settings"):
+                check_complete(job)
+
+
+def test_tables_have_the_papers_names_of_the_strategies() -> None:
+    titles = [paper.STRATEGY_TITLES[strategy] for strategy in paper.ABLATION_STRATEGIES]
+    assert titles == ["ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive"]
 
 
 def test_test_instances() -> None:
@@ -136,22 +181,43 @@ def test_test_instances() -> None:
 
 
 def test_best_of_what_is_shown() -> None:
-    assert best([1.0, 2.001, None, 1.999, float("nan")]) == [1, 3]
-    assert best([1.0, 2.0, None], smallest=True) == [0]
-    assert best([None, float("nan")]) == []
+    assert best(["1.00", "2.00", "-", "2.00"]) == [1, 3]
+    assert best(["1.00", "2.00", "-"], smallest=True) == [0]
     # Small times are shown with more digits than others.
-    times = [0.0012, 0.0038, 0.00119, 0.2]
-    assert best(times, smallest=True, show=seconds) == [0, 2]
-    assert best(times, smallest=True) == [0, 1, 2]
-    assert best([0.12, 0.1234], smallest=True, show=seconds) == [0, 1]
+    assert [seconds(time) for time in (0.0012, 0.00119, 0.2)] == ["0.0012", "0.0012", "0.20"]
+    assert best(["0.0012", "0.0038", "0.0012", "0.20"], smallest=True) == [0, 2]
+
+
+def test_a_method_alone_is_not_the_best() -> None:
+    """There is nothing that it is better than."""
+    assert best(["0.00", "-", "-"], smallest=True) == best(["-", "5.00"]) == best(["-", "-"]) == []
+    columns = [*map(Column, ("Number of tasks", "Measure", "Source")), Column("Gurobi", "30"), Column("DL-DRL", "30")]
+    table = Table("Table II", "Results", [*columns, Column("OR-tools", "500"), Column("DL-DRL", "500")])
+    table.add(["80", "Obj.", "ours", "5.00", "-", "1.00", "2.00"])
+    table.add(["80", "Gap", "ours", "0.00", "-", "50.00", "0.00"])
+    table.add(["80", "Time(s)", "ours", "0.00", "-", "50.00", "0.00"])
+    table.add(["100", "Obj.", "ours", "-", "-", "-", "7.00"])
+    lay_out(table)
+    assert table.bold == {(0, 6), (1, 6)} and table.rules == [0, 3]
+
+
+def test_best_methods_of_each_fleet_and_source() -> None:
+    columns = [*map(Column, ("Fleet", "Method", "Source")), Column("Obj.", "N=600"), Column("Time(s)", "N=600")]
+    table = Table("Table IV", "Larger", columns)
+    for cells in ("U4 a paper 1.00 9.00", "U4 a ours 3.00 8.00", "U4 b paper 2.00 7.00", "U4 b ours 2.00 6.00"):
+        table.add(cells.split())
+    table.add("U6 a ours 1.00 1.00".split())
+    lay_out(table)
+    assert table.bold == {(2, 3), (1, 3), (2, 4), (3, 4)} and table.rules == [0, 4]
 
 
 def test_a_table_in_three_formats() -> None:
-    table = Table("A & B", [Column("Name"), Column("x", "all"), Column("y", "all")], notes=["50 % of a_b"])
-    table.add(["one|two", "1.00", "-"], bold=[1, 2])
-    table.start_part()
+    table = Table("Table V", "A & B", [Column("Name"), Column("x", "all"), Column("y", "all")], notes=["50 % of a_b"])
+    table.add(["one|two", "1.00", "-"])
     table.add(["R&D", "2.00", "3.00"])
+    table.bold, table.rules = {(0, 1), (0, 2)}, [0, 1]
     markdown = to_markdown(table, ["Seed: 1"])
+    assert markdown.startswith("# Table V: A & B\n")
     assert "| Name | all: x | all: y |\n| --- | ---: | ---: |\n| one\\|two | **1.00** | **-** |\n" in markdown
     assert "- 50 % of a_b" in markdown and "- Seed: 1" in markdown
     latex = to_latex(table, ["Seed: 1"])
@@ -161,6 +227,77 @@ def test_a_table_in_three_formats() -> None:
     assert to_csv(table, ["Seed: 1"]).splitlines()[-3:] == ["Name,all: x,all: y", "one|two,1.00,", "R&D,2.00,3.00"]
     with pytest.raises(ValueError, match="2 cells, the table 3 columns"):
         table.add(["too", "few"])
+
+
+def test_captions_do_not_print_the_number_twice() -> None:
+    """LaTeX writes "Table 1: " before a caption by itself."""
+    latex = to_latex(Table("Table II", "Results", [Column("a")], [["1"]]), [])
+    assert r"\caption{Results}" in latex and "Table II" not in latex
+
+
+# ---------------------------------------------------------------------------------------------------------- written again
+
+
+@pytest.fixture
+def committed(tmp_path: Path) -> Path:
+    """A copy of the results in the repository, without what can be made from the CSV files."""
+    for path in RESULTS.glob("*.csv"):
+        shutil.copyfile(path, tmp_path / path.name)
+    return tmp_path
+
+
+def test_committed_files_are_what_the_command_writes(committed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """But for the pictures, which depend on the version of matplotlib."""
+    assert cli.main(["reproduce", "all", "--redraw", "--out", str(committed)]) == 0
+    written = {path.name for path in committed.iterdir()}
+    printed = {Path(line).name for line in capsys.readouterr().out.splitlines()}
+    assert written == {path.name for path in RESULTS.iterdir()} == printed
+    for path in RESULTS.iterdir():
+        if path.suffix in (".md", ".tex", ".csv"):
+            assert (committed / path.name).read_text() == path.read_text(), path.name
+        else:
+            found, expected = ((folder / path.name).stat().st_size for folder in (committed, RESULTS))
+            assert found == pytest.approx(expected, rel=0.3), path.name
+
+
+def test_pictures_of_the_same_data_are_equal(committed: Path) -> None:
+    """They hold no time, so that only what changed is written to the repository."""
+    contents = []
+    for _ in range(2):
+        assert cli.main(["reproduce", "fig5", "--redraw", "--out", str(committed)]) == 0
+        contents.append([(committed / f"fig5{suffix}").read_bytes() for suffix in (".png", ".pdf")])
+    assert contents[0] == contents[1]
+
+
+def test_pictures_say_where_they_come_from_without_the_name_of_the_machine() -> None:
+    origin = Origin.of("sb3-uav reproduce fig5", CPU, 3)
+    (machine,) = (line for line in origin.lines if line.startswith("Machine: "))
+    assert re.fullmatch(r"Machine: \w+ \w+, \d+ CPUs", machine)
+    assert platform.release() not in " ".join(origin.lines) and platform.node() not in machine
+    assert origin.metadata(".png")["Description"] == origin.metadata(".pdf")["Subject"] == " | ".join(origin.lines)
+    assert origin.footer() == "sb3-uav reproduce, scale cpu, seed 3"
+    assert Origin.read([*origin.lines, "a note"]) == (origin, ["a note"])
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("", "is no table that `sb3-uav reproduce` wrote"),
+        ("a,b\n1,2\n", "is no table that `sb3-uav reproduce` wrote"),
+        ("# Fig. 6: x\na,b\n1\n", "1 cells, the table 2 columns"),
+        ("# Fig. 6: x\n# y\na,b\n1,2\n", "its comments do not begin with Command, Scale, Seed"),
+    ],
+)
+def test_damaged_csv_files(content: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "fig6.csv").write_text(content)
+    assert cli.main(["reproduce", "fig6", "--redraw", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{tmp_path / 'fig6.csv'}: " in error and message in error
+
+
+def test_nothing_to_redraw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["reproduce", "fig6", "--redraw", "--out", str(tmp_path)]) == 2
+    assert "holds no CSV of fig6; give a folder" in capsys.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------------- logs of trainings
@@ -184,10 +321,10 @@ def test_phase_times(logged: Model) -> None:
 
 def test_curves(logged: Model) -> None:
     assert logged.its_log is not None
-    curves = read_curves(logged.its_log)
+    curves = read_logged_curves(logged.its_log)
     assert curves["allocator"].cost.tolist() == [-30.0, -31.0]
     assert curves["allocator"].minutes.tolist() == pytest.approx([18 / 60, 41 / 60])
-    assert curves["router"].n_pretraining == 1 and curves["router"].minutes[-1] == pytest.approx(47 / 60)
+    assert curves["router"].phase.count("pre-training") == 1 and curves["router"].minutes[-1] == pytest.approx(47 / 60)
     assert curves["router"].generation_minutes == pytest.approx(3 / 60)
 
 
@@ -206,6 +343,6 @@ def test_curves(logged: Model) -> None:
 def test_damaged_logs(content: str | bytes, message: str, logged: Model) -> None:
     assert logged.its_log is not None
     logged.its_log.write_bytes(content.encode() if isinstance(content, str) else content)
-    for read in (lambda: phase_times(logged), lambda: read_curves(logged.folder / "its_log.csv")):
+    for read in (lambda: phase_times(logged), lambda: read_logged_curves(logged.folder / "its_log.csv")):
         with pytest.raises(ValueError, match=re.escape(str(logged.its_log)) + message):
             read()

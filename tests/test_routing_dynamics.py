@@ -26,7 +26,7 @@ from sb3_uav.envs import (
 )
 from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingState
 
-# Ways of adding up the legs of a tour, which differ in their last bits.
+# Ways of adding up the legs of a tour, whose results differ in the last bits.
 SUMS: dict[str, Callable[[list[float]], float]] = {
     "forward": sum,
     "backward": lambda legs: sum(reversed(legs)),
@@ -44,7 +44,7 @@ def legs(instances: Instances, row: int, route: list[int]) -> list[float]:
 
 
 def follow(instances: Instances, route: list[int]) -> list[bool]:
-    """Whether each step of a route (in a batch of one) is legal when it comes."""
+    """Whether each step of a route (in a batch of one) is legal at its time."""
     dynamics = RoutingDynamics(instances)
     state = dynamics.reset()
     legal = []
@@ -56,12 +56,12 @@ def follow(instances: Instances, route: list[int]) -> list[bool]:
 
 @st.composite
 def tours_at_the_limit(draw: st.DrawFn) -> tuple[Instances, list[int]]:
-    """An instance whose D is the length of a tour, added up in some order, or a little beside it; and that tour."""
+    """An instance whose D is about the length of a tour, added up in some order; and that tour."""
     n_tasks = draw(st.integers(1, 7))
     scale = draw(st.sampled_from([1.0, 1e-30, 1e-3, 1e6, 1e30]))
     points = scale * draw(layouts(n_tasks))
     route = draw(st.permutations(range(n_tasks)))[: draw(st.integers(1, n_tasks))]
-    # One part in a billion is the tolerance, 1e-9 itself the border where rounding decides.
+    # On both sides of the tolerance, but not so close to it that rounding decides.
     factor = draw(st.sampled_from([1.0, 1.0, 1 - 1e-13, 1 + 1e-13, 1 - 9e-10, 1 - 1.1e-9, 1 - 1e-6, 1 + 1e-6, 0.7, 2.0]))
     instances = Instances.from_arrays(points[0], points[1:], max_distance=scale, n_uavs=1)
     length = SUMS[draw(st.sampled_from(sorted(SUMS)))](legs(instances, 0, route))
@@ -94,6 +94,46 @@ def test_a_tour_of_exactly_the_maximum_is_feasible(case: tuple[Instances, list[i
     assert check_schedule(instances, 0, Schedule([route])).length == pytest.approx(length, rel=1e-12, abs=0)
 
 
+@st.composite
+def lattice_tours(draw: st.DrawFn) -> tuple[np.ndarray, list[int]]:
+    """A depot and tasks on a lattice of any spacing and place, ``(n_tasks + 1, 2)``, and a tour of some of them."""
+    n_tasks = draw(st.integers(1, 8))
+    cells = st.tuples(st.integers(0, 6), st.integers(0, 6))
+    points = np.array(draw(st.lists(cells, min_size=n_tasks + 1, max_size=n_tasks + 1)), dtype=float)
+    spacing = draw(st.sampled_from([1.0, 0.1, 1 / 3, 7.0, 100.0, 1e-6]))
+    offset = spacing * draw(st.sampled_from([0, 1, -3, 1000]))
+    route = draw(st.permutations(range(n_tasks)))[: draw(st.integers(1, n_tasks))]
+    return offset + spacing * points, route
+
+
+@settings(max_examples=300)
+@given(case=lattice_tours())
+def test_lattice_tours_of_exactly_the_maximum_are_flyable(case: tuple[np.ndarray, list[int]]) -> None:
+    """With D computed from the coordinates, also one unit in the last place less or more; 0.1 % less is too short."""
+    points, route = case
+    stops = points[[0, *(task + 1 for task in route), 0]]
+    length = float(np.hypot(*np.diff(stops, axis=0).T).sum())
+    if length == 0:
+        return
+    for limit in (length, np.nextafter(length, 0), np.nextafter(length, np.inf)):
+        instances = Instances.from_arrays(points[0], points[1:], max_distance=limit, n_uavs=1)
+        assert all(follow(instances, route))
+        assert check_schedule(instances, 0, Schedule([route])).objective == len(route)
+    short = Instances.from_arrays(points[0], points[1:], max_distance=0.999 * length, n_uavs=1)
+    assert not all(follow(short, route))
+    with pytest.raises(InfeasibleScheduleError, match="over its maximum"):
+        check_schedule(short, 0, Schedule([route]))
+
+
+def test_the_perimeter_of_a_lattice_square_is_flyable() -> None:
+    """Twelve steps of 0.1, whose sum in floats differs from D = 1.2 in the last digits."""
+    ring = [(0.1 * i, 0.0) for i in range(1, 4)] + [(0.3, 0.1 * i) for i in range(1, 4)]
+    ring += [(0.1 * i, 0.3) for i in (2, 1, 0)] + [(0.0, 0.1 * i) for i in (2, 1)]
+    instances = Instances.from_arrays([0, 0], ring, max_distance=1.2, n_uavs=1)
+    assert all(follow(instances, list(range(11))))
+    assert check_schedule(instances, 0, Schedule([range(11)])).objective == 11
+
+
 @settings(max_examples=100)
 @given(instances=instance_batches(), seed=seeds)
 def test_every_accepted_tour_passes_the_checker(instances: Instances, seed: int) -> None:
@@ -113,7 +153,7 @@ def test_every_accepted_tour_passes_the_checker(instances: Instances, seed: int)
 @settings(max_examples=100)
 @given(instances=instance_batches(max_tasks=6), seed=seeds)
 def test_every_schedule_that_passes_the_checker_is_accepted(instances: Instances, seed: int) -> None:
-    """Random routes of all UAVs, feasible or not: checker and masks say the same of each."""
+    """Random routes, feasible or not: checker and masks agree on each."""
     rng = np.random.default_rng(seed)
     for row in range(len(instances)):
         real = int(instances.task_mask[row].sum())
@@ -129,7 +169,7 @@ def test_every_schedule_that_passes_the_checker_is_accepted(instances: Instances
 @settings(max_examples=80)
 @given(instances=instance_batches(), seed=seeds)
 def test_mask_is_its_definition(instances: Instances, seed: int) -> None:
-    """Task by task, in plain Python: real, unvisited, and there and home again within D; the depot if no task is."""
+    """For each task, in plain Python: real, unvisited, and there and back within D; the depot if no task is legal."""
     rng = np.random.default_rng(seed)
     dynamics = RoutingDynamics(instances)
     state = dynamics.reset(2)
@@ -149,7 +189,7 @@ def test_mask_is_its_definition(instances: Instances, seed: int) -> None:
 
 
 def assert_mask(instances: Instances, row: int, route: list[int], mask: list[bool]) -> None:
-    """A mask against the definition, where D is not so near that rounding decides."""
+    """Compare a mask with the definition, except where rounding decides."""
     limit = instances.max_distance[row].item() * (1 + 1e-9)
     for task in range(instances.n_tasks):
         length = math.fsum(legs(instances, row, [*route, task]))
@@ -163,7 +203,7 @@ def assert_mask(instances: Instances, row: int, route: list[int], mask: list[boo
 @settings(max_examples=80)
 @given(instances=instance_batches(), seed=seeds, lawful_steps=st.integers(0, 4), forbidden=st.integers(0, 1000))
 def test_illegal_action_flies_home(instances: Instances, seed: int, lawful_steps: int, forbidden: int) -> None:
-    """From wherever the UAV is, within D, for no reward; so ends the episode."""
+    """From anywhere, within D and without a reward, which ends the episode."""
     rng = np.random.default_rng(seed)
     dynamics = RoutingDynamics(instances[:1])
     state = dynamics.reset()
@@ -213,7 +253,7 @@ def test_reachable_tasks_are_the_first_mask(instances: Instances) -> None:
 @settings(max_examples=60)
 @given(instances=instance_batches())
 def test_nearest_feasible_is_its_definition(instances: Instances) -> None:
-    """A legal tour, that goes to the nearest legal task at every step and home only at the end."""
+    """A legal tour that goes to the nearest legal task at every step, and to the depot only at the end."""
     tours = nearest_feasible(instances)
     dynamics = RoutingDynamics(instances)
     state = dynamics.reset()

@@ -79,7 +79,7 @@ def test_objective_and_lengths(
     ],
 )
 def test_each_constraint_has_its_message(square: Instances, routes: list[list[int]], message: str | None) -> None:
-    """Without a message the schedule is feasible: the neighbours of the infeasible ones."""
+    """Cases without a message are feasible schedules similar to the infeasible ones."""
     if message is None:
         check_schedule(square, 1, Schedule(routes))
     else:
@@ -151,7 +151,7 @@ def test_agrees_with_exact_arithmetic(instances: Instances, seed: int) -> None:
 
 
 def test_is_independent_of_the_dynamics() -> None:
-    """Of all our code it may use the instances' data and the tolerance, but no function."""
+    """Of this package it may use the data of the instances and the tolerance, but no function."""
     imported = set()
     for node in ast.walk(ast.parse(inspect.getsource(schedule_module))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sb3_uav"):

@@ -38,6 +38,8 @@ def test_defaults_are_for_solvers_that_have_them() -> None:
         ("kmeans-nearest:restarts=__import__('os')", "must be of type int"),
         ("kmeans-nearest:restarts=1,restarts=2", "given the option 'restarts' twice"),
         ("kmeans-nearest:restarts=0", "at least 1 start"),
+        ('dl-drl:allocator="a,b.zip', r"begins with a quote; end it with another one"),
+        ("dl-drl:allocator='a'.zip", r"begins with a quote; end it with another one, followed by a comma"),
         (
             "dl-drl:allocator=a.zip",
             r"a\.zip is one zip of a pair, and its router is missing: give both, or the name of a pair",
@@ -66,5 +68,16 @@ def test_typed_options(monkeypatch: pytest.MonkeyPatch) -> None:
     solver: Any = make_solver("typed:number=1e-3,flag=true,text=a=b")
     # As JSON, because there True is not 1.
     assert json.dumps(solver.options) == json.dumps(dict(number=1e-3, flag=True, text="a=b"))
+    for spec, text in (
+        ('typed:text="a,b.zip",flag=1', "a,b.zip"),
+        ("typed:text='C:\\a,b\\\"c\".zip',flag=true", 'C:\\a,b\\"c".zip'),
+        ("typed:flag=1,text='it''s, \"so\"'", 'it\'s, "so"'),
+        ('typed:text="",flag=1', ""),
+        ('typed:flag=1,text=5" pipe', '5" pipe'),
+        ("typed:text=C:\\a.zip,flag=1", "C:\\a.zip"),
+    ):
+        solver = make_solver(spec)
+        assert solver.options == dict(number=1.0, flag=True, text=text) and solver.name == spec
+    assert make_solver('typed:name="a, b",text="c,d"').name == "a, b"
     with pytest.raises(ValueError, match="'flag=yes' of solver 'typed' must be true or false, or 1 or 0"):
         make_solver("typed:flag=yes")

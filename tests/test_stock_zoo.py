@@ -16,6 +16,7 @@ import yaml
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 
+from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id, routing_id
@@ -155,7 +156,7 @@ def test_training_goes_on_in_a_batched_environment(folder, routing):
     assert {path.name for path in second.iterdir() if path.suffix == ".csv"} == {"0.monitor.csv"}
     assert np.load(second / "evaluations.npz")["timesteps"].tolist() == [0, 160, 320]
     before, after = PPO.load(routing / f"{ROUTING}.zip"), PPO.load(second / f"{ROUTING}.zip")
-    assert after._n_updates == before._n_updates + 2
+    assert n_updates(after) == n_updates(before) + 2
     old, new = before.policy.state_dict(), after.policy.state_dict()
     assert old.keys() == new.keys() and any(not th.equal(old[key], new[key]) for key in old)
 

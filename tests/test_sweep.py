@@ -1,4 +1,4 @@
-"""Other views of an instance: they change how it is shown, never what it is."""
+"""Orders and symmetries of instances: they change the presentation of an instance, not the instance."""
 
 from __future__ import annotations
 

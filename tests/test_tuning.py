@@ -233,7 +233,7 @@ def test_mistakes_in_the_yaml_stop_the_study(tmp_path, capsys):
     config = write_config(tmp_path, "ppo", ROUTING, policy_kwargs=dict(embed_dims=8))
     assert optimize(tmp_path, "ppo", ROUTING, config) == 2
     error = capsys.readouterr().err
-    assert "unexpected keyword argument 'embed_dims'" in error and "tiny.yml" in error
+    assert "embed_dims" in error and "tiny.yml" in error
 
 
 @pytest.mark.slow

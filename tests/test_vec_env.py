@@ -56,14 +56,14 @@ from sb3_uav.envs import (
 def test_plays_the_episodes_of_dummy_vec_env(
     level: str, seed: int, n_envs: int, n_tasks: int, max_distance: float, distribution: str, recklessness: float
 ) -> None:
-    """Seeded alike, step by step, over several episodes of unequal lengths, with illegal actions or without."""
+    """With the same seed, step by step, over several episodes of unequal lengths, with and without illegal actions."""
     fns = env_fns(level, n_envs, n_tasks=n_tasks, max_distance=max_distance, distribution=distribution)
     ours, theirs = BatchedVecEnv(fns), DummyVecEnv(fns)
     assert ours.seed(seed) == theirs.seed(seed)
     assert_same_arrays(reset(ours), reset(theirs))
     rng = np.random.default_rng(seed)
     assert assert_same_run(ours, theirs, rng, 3 * n_tasks + 3, recklessness) >= 3 * n_envs
-    # A reset in the middle of episodes goes on with the same random numbers.
+    # A reset during episodes continues with the same random numbers.
     assert_same_arrays(reset(ours), reset(theirs))
     assert_same_run(ours, theirs, rng, n_tasks, recklessness)
     assert ours.reset_infos == theirs.reset_infos
@@ -102,12 +102,12 @@ def test_options_and_seeds_are_used_once(level: str, instances: Instances, seed:
     assert_same_arrays(first, reset(theirs))
     n_tasks = instances.n_tasks
     assert first["task_mask"].sum(1).tolist() == [n_tasks if row != 1 else 10 for row in range(n_envs)]
-    assert np.array_equal(first["tasks"][0, : 2 * n_tasks], instances.tasks[0].float().flatten().numpy())
+    assert np.array_equal(first["tasks"][0, : 2 * n_tasks], instances.near_origin().tasks[0].float().flatten().numpy())
     assert_same_run(ours, theirs, np.random.default_rng(seed), n_tasks + 2, 0.0)
     again = reset(ours)
     assert_same_arrays(again, reset(theirs))
     assert again["task_mask"].all()
-    # One dict is for all rows.
+    # A single dict applies to all rows.
     ours.set_options({"instance": instances[0]})
     assert (reset(ours)["task_mask"].sum(1) == n_tasks).all()
 
@@ -127,7 +127,7 @@ def test_bad_options_are_refused(level: str) -> None:
 
 
 def test_fleet_of_a_given_instance() -> None:
-    """Allocation refuses another number of UAVs than its actions have; the router does not care, in any row."""
+    """Allocation refuses a number of UAVs other than that of its actions; routing accepts any, in every row."""
     other_fleet: dict[str, Any] = {"instance": UniformGenerator(4, n_uavs=6)(1, np.random.default_rng(0))}
     allocation, routing = batched_env("allocation", 2, n_tasks=4), batched_env("routing", 2, n_tasks=4)
     for env in (allocation, routing):
@@ -152,7 +152,7 @@ def test_rows_and_seeds(level: str) -> None:
 
 @both_levels
 def test_nothing_returned_shares_memory(level: str) -> None:
-    """Overwriting everything that is handed out changes neither the episodes nor what is returned next."""
+    """Overwriting all returned arrays changes neither the episodes nor later results."""
     runs = []
     for vandal in (False, True):
         env = batched_env(level, 3, n_tasks=4)
@@ -198,7 +198,7 @@ def test_step_before_reset(level: str) -> None:
 
 @both_levels
 def test_thousands_of_rows(level: str) -> None:
-    """2048 rows play whole episodes; row 1000 as it plays alone."""
+    """2048 rows play whole episodes, and row 1000 equals a single environment."""
     env = batched_env(level, 2048, n_tasks=20)
     env.seed(0)
     observation = reset(env)
@@ -229,7 +229,7 @@ class Halved(TransformReward):
 
 
 class Shaped(RoutePlanningEnv):
-    """Overrides what the batch would not call."""
+    """Overrides a method that BatchedVecEnv does not call."""
 
     def step(self, action: Any) -> Any:
         observation, reward, *rest = super().step(action)
@@ -237,7 +237,7 @@ class Shaped(RoutePlanningEnv):
 
 
 class Sly(Monitor):
-    """Is a Monitor, but not only."""
+    """A Monitor that also changes rewards."""
 
     def step(self, action: Any) -> Any:
         observation, reward, *rest = super().step(action)
@@ -257,19 +257,19 @@ class Sly(Monitor):
     ids=["foreign", "wrapped", "wrapped inside", "subclass", "subclass inside", "subclass of Monitor"],
 )
 def test_refuses_what_it_would_not_play(make: Callable[[], gym.Env]) -> None:
-    """Foreign environments, and everything that changes what one of ours does."""
+    """Foreign environments, and wrappers and subclasses that change behavior."""
     with pytest.raises(ValueError, match=r"BatchedVecEnv cannot batch <.*; use stable_baselines3's DummyVecEnv for it"):
         BatchedVecEnv([make])
 
 
 def test_accepts_transparent_wrappers() -> None:
-    """What ``gym.make`` and ``make_vec_env`` put around an environment."""
+    """The wrappers of ``gym.make`` and ``make_vec_env``."""
     for env in (
         gym.make("RoutePlanning-N20-v0"),
         OrderEnforcing(PassiveEnvChecker(RoutePlanningEnv())),
     ):
         assert BatchedVecEnv([partial(Monitor, env)]).template is env.unwrapped
-    # A limit may cut episodes off.
+    # A limit may truncate episodes.
     with pytest.raises(ValueError, match="cannot batch"):
         BatchedVecEnv([lambda: TimeLimit(RoutePlanningEnv(), max_episode_steps=5)])
     made = make_vec_env("TaskAllocation-U3-N20-v0", n_envs=2, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
@@ -309,7 +309,7 @@ def test_instances_are_those_of_the_rows(level: str) -> None:
 
 @both_levels
 def test_methods(level: str) -> None:
-    """``action_masks`` answers by row; what the rows share is called once, for all of them or not at all."""
+    """``action_masks`` returns a result per row; shared methods are called once, for all rows only."""
     env = batched_env(level, 3, n_tasks=4)
     reset(env)
     masks = env.action_masks()
@@ -328,7 +328,7 @@ def test_methods(level: str) -> None:
 @pytest.mark.parametrize("by_method", [True, False])
 @both_levels
 def test_set_generator(level: str, by_method: bool) -> None:
-    """For all rows, from their next episode on."""
+    """It takes effect in all rows with their next episodes."""
     env = batched_env(level, 3, n_tasks=4)
     first = reset(env)
     source = FixedGenerator(UniformGenerator(4, 1 if level == "routing" else 4)(1, np.random.default_rng(0)))
@@ -343,7 +343,7 @@ def test_set_generator(level: str, by_method: bool) -> None:
 
 
 def test_set_router() -> None:
-    """By ``env_method``, as a training callback hands the router over; in all rows and in running episodes."""
+    """By ``env_method``, as training callbacks do, in all rows and during episodes."""
     env = batched_env("allocation", 3, n_tasks=2)
 
     def final_rewards() -> list[float]:
@@ -360,7 +360,7 @@ def test_set_router() -> None:
 
 
 def test_env_is_wrapped() -> None:
-    """In a Monitor, as far as SB3 wants to know: its statistics are in the infos."""
+    """Reported as wrapped in a Monitor, because the infos have its statistics."""
 
     class OtherMonitor(Monitor):
         pass

@@ -1,4 +1,4 @@
-"""``BatchedVecEnv`` in the hands of SB3: monitors, wrappers, evaluation and training."""
+"""``BatchedVecEnv`` with SB3: monitors, wrappers, evaluation and training."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.results_plotter import X_TIMESTEPS, ts2xy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_uav.envs import (
@@ -42,7 +43,7 @@ def run_random(env: VecEnv, n_steps: int) -> list[list[dict[str, float]]]:
 
 
 @pytest.mark.parametrize("env_id", ["RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"])
-def test_monitor_file_holds_the_episodes_of_row_0(env_id: str, tmp_path: Path) -> None:
+def test_monitor_file_holds_the_episodes_of_all_rows(env_id: str, tmp_path: Path) -> None:
     env = make_vec_env(
         env_id,
         n_envs=3,
@@ -55,10 +56,24 @@ def test_monitor_file_holds_the_episodes_of_row_0(env_id: str, tmp_path: Path) -
     env.close()
     assert [path.name for path in tmp_path.iterdir()] == ["0.monitor.csv"]
     results = load_results(str(tmp_path))
-    assert len(episodes[0]) >= 3 and len(results) == len(episodes[0])
-    for column in ("r", "l", "objective", "illegal_actions"):
-        assert results[column].tolist() == pytest.approx([episode[column] for episode in episodes[0]])
+    played = [episode for row in episodes for episode in row]
+    assert min(len(row) for row in episodes) >= 3 and len(results) == len(played)
+    columns = ["r", "l", "objective", "illegal_actions"]
+    found, expected = results[columns].values.tolist(), [[episode[column] for column in columns] for episode in played]
+    assert sorted(found) == pytest.approx(np.array(sorted(expected)))
     assert results["t"].is_monotonic_increasing
+
+
+def test_plots_of_monitor_files_show_the_true_time_steps(tmp_path: Path) -> None:
+    """SB3's plots count the steps of all complete episodes of all rows."""
+    folder = str(tmp_path)
+    env = make_vec_env("RoutePlanning-N20-v0", n_envs=4, monitor_dir=folder, vec_env_cls=BatchedVecEnv)  # type: ignore[arg-type]
+    model = PPO("MultiInputPolicy", env, n_steps=64, batch_size=64, n_epochs=1, seed=0, policy_kwargs={"net_arch": [8]})
+    model.learn(4 * 64 * 3)
+    env.close()
+    steps, _ = ts2xy(load_results(folder), X_TIMESTEPS)
+    # The last episode of each row may be incomplete.
+    assert model.num_timesteps == 768 and 768 - 4 * 20 <= steps[-1] <= 768
 
 
 @both_levels
@@ -80,7 +95,7 @@ def test_vec_monitor(level: str, tmp_path: Path) -> None:
 
 @both_levels
 def test_vec_normalize(level: str) -> None:
-    """Rewards normalized, observations left alone, and the originals at hand."""
+    """Rewards are normalized, observations are not, and the original rewards remain available."""
     plain, inner = batched_env(level, 3, n_tasks=4), batched_env(level, 3, n_tasks=4)
     env = VecNormalize(inner, norm_obs=False)
     plain.seed(0)
@@ -98,7 +113,7 @@ def test_vec_normalize(level: str) -> None:
 
 
 class RandomPolicy:
-    """Any legal action, as observed."""
+    """Takes any legal action in the observation."""
 
     def __init__(self) -> None:
         self.rng = np.random.default_rng(0)

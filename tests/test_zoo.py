@@ -23,45 +23,17 @@ from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.its_checkpoint import read_state
 
 pytest.importorskip("rl_zoo3")
+from tiny_zoo import ENV, EPOCH, its_with, run, write_config
+
 from sb3_uav.cli import main as cli
 from sb3_uav.studies.demo import evaluate_run, newest_run
 from sb3_uav.zoo import enjoy, train
 from sb3_uav.zoo.configs import default_config, parse_schedule, plain_numbers
 
-ENV = "TaskAllocation-U3-N20-v0"
-NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
-# Steps of an epoch: 8 instances of 20 tasks.
-EPOCH = 8 * 20
-
-
-def entry(**changes: Any) -> dict[str, Any]:
-    router: dict[str, Any] = dict(algo="reinforce", policy="RouterPolicy", n_envs=4, policy_kwargs=NETWORK, learning_rate=1e-3)
-    its = dict(router=router, n_epochs=3, n_pretraining_epochs=1, n_intensive_epochs=2, n_continuous_epochs=2)
-    settings = dict(
-        policy="sb3_uav.policies.AllocatorPolicy",
-        policy_kwargs=NETWORK,
-        n_envs=4,
-        n_timesteps=3 * EPOCH,
-        instances_per_epoch=8,
-        learning_rate=1e-3,
-        callback=[{"sb3_uav.training.ITSCallback": its}],
-    )
-    return {**settings, **changes}
-
-
-def write_config(folder: Path, **changes: Any) -> Path:
-    path = folder / "tiny.yml"
-    path.write_text(yaml.safe_dump({ENV: entry(**changes)}))
-    return path
-
-
-def run(folder: Path, config: Path, *flags: str) -> int:
-    return train.main(["--env", ENV, "--conf-file", str(config), "-f", str(folder / "logs"), "--seed", "1", *flags])
-
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of `python -m sb3_uav.zoo.train` in a process of its own; the folder above its logs."""
+    """A run of `python -m sb3_uav.zoo.train` in a separate process; the folder above its logs."""
     folder = tmp_path_factory.mktemp("zoo")
     config = write_config(folder)
     flags = ["--eval-freq", "160", "--eval-episodes", "4", "--save-freq", "320", "-tb", str(folder / "tb"), "--seed", "1"]
@@ -255,55 +227,6 @@ def test_hyperparameters_of_the_command_line(tmp_path):
     assert run(tmp_path, config, "-n", "80", "-params", "learning_rate:0.5", "baseline:'none'", "--eval-freq", "-1") == 0
     model = REINFORCE.load(run_folder(tmp_path) / f"{ENV}.zip")
     assert (model.learning_rate, model.baseline, model.num_timesteps) == (0.5, "none", 80)
-
-
-# ------------------------------------------------------------------------------------------ bad input
-
-
-def its_with(**changes: Any) -> dict[str, Any]:
-    callback = entry()["callback"]
-    callback[0]["sb3_uav.training.ITSCallback"].update(changes)
-    return dict(callback=callback)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (dict(learnin_rate=1), "unknown key 'learnin_rate'; did you mean 'learning_rate'?"),
-        (dict(baseline="rollout", frobnicate=1), "unknown key 'frobnicate'; known keys:"),
-        (dict(learning_rate="fast"), "learning_rate is 'fast'; write a number, lin_X or const_X."),
-        (dict(baseline="rolout"), "baseline is 'rolout'; choose one of"),
-        (dict(policy_kwargs=dict(preset="papper")), "preset is 'papper'"),
-        (its_with(n_epoch=3), "an argument of 'callback' does not fit"),
-        (its_with(strategy="none"), "strategy is 'none'"),
-        (dict(policy_kwargs=dict(embed_dims=8)), "unexpected keyword argument 'embed_dims'"),
-        (dict(policy="sb3_uav.policies.AlocatorPolicy"), "AlocatorPolicy"),
-        (its_with(router=dict(policy="RouterPolicy", n_stepz=3)), "these arguments do not fit algorithm 'reinforce'"),
-    ],
-)
-def test_typos_in_the_yaml_are_named(tmp_path, capsys, changes, message):
-    config = write_config(tmp_path, **changes)
-    assert run(tmp_path, config, "--eval-freq", "-1") == 2
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.rglob("*.zip"))
-
-
-def test_broken_configs_are_named(tmp_path, capsys):
-    config = tmp_path / "broken.yml"
-    for text, message in (
-        ("a: [1", "cannot be read"),
-        ("other: {policy: MlpPolicy}", "Hyperparameters not found"),
-        (f"{ENV}: {{policy: MlpPolicy}}", "needs at least n_timesteps and policy"),
-    ):
-        config.write_text(text)
-        assert run(tmp_path, config) == 2
-        error = capsys.readouterr().err
-        assert message in error and "broken.yml" in error
-    assert run(tmp_path, tmp_path / "missing.yml") == 2
-    assert "missing.yml" in capsys.readouterr().err
-    assert train.main(["--env", "TaskAllocation-U3-N21-v0"]) == 2
-    error = capsys.readouterr().err
-    assert "TaskAllocation-U3-N21-v0 not found in gym registry, you maybe meant TaskAllocation-U3-N20-v0?" in error
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.optional import require
 from sb3_uav.plots.anytime import plot_anytime
 
 
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help="names of the solvers to draw (default: all)")
     args = parser.parse_args(argv)
+    require("matplotlib.figure", "Drawing", "plots")
     figures = args.out or [args.results / "anytime.png", args.results / "anytime.pdf"]
     for path in plot_anytime(args.results, figures, args.solvers):
         print(path)

@@ -7,16 +7,19 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.optional import require
+from sb3_uav.zoo.dependencies import require_zoo
+
 
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav compare",
         description="Train PPO, MaskablePPO and REINFORCE from their YAMLs at an equal budget of environment steps, evaluate "
         "all on one validation set along the way, and write evaluations.csv, comparison.png, comparison.pdf and report.md. "
-        "Run it again with the same --out to go on: finished runs are kept, interrupted ones start again.",
+        "Rerun with the same --out to resume: finished runs are kept, interrupted ones restart.",
     )
     parser.add_argument("--env", required=True, help="id of an environment of sb3_uav")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of everything that is written")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     parser.add_argument(
         "-n", "--n-timesteps", type=int, default=1_000_000, help="environment steps of each run, default: %(default)s"
     )
@@ -25,23 +28,23 @@ def make_parser() -> argparse.ArgumentParser:
         "--variants",
         type=Path,
         metavar="YML",
-        help="what to compare instead: a mapping from names to {algo: NAME, KEY: VALUE, ...}, whose keys replace those of the "
+        help="variants to compare: a mapping from names to {algo: NAME, KEY: VALUE, ...}, whose keys replace those of the "
         "environment's entry in zoo_configs/NAME.yml (or in conf_file: PATH); null removes one",
     )
     parser.add_argument(
         "--router",
         type=Path,
         metavar="ZIP",
-        help="TaskAllocation only: the router of all rewards; one is trained if not given",
+        help="TaskAllocation only: the router that determines all rewards; trained if not given",
     )
     parser.add_argument(
         "--router-subsets",
         type=int,
         default=100_000,
-        help="on how many subsets to train the router if none is given, default: %(default)s",
+        help="number of training subsets of that router, default: %(default)s",
     )
     parser.add_argument(
-        "--its", action="store_true", help="leave ITSCallback in the YAML entries: every run trains a router of its own"
+        "--its", action="store_true", help="keep ITSCallback in the YAML entries: every run trains its own router"
     )
     parser.add_argument("--instances", type=Path, metavar="NPZ", help="validation set; drawn once if not given")
     parser.add_argument("--n-instances", type=int, default=256, help="size of a drawn validation set, default: %(default)s")
@@ -66,6 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     settings = vars(make_parser().parse_args(arguments))
+    # Report missing packages before the long run.
+    require_zoo("A comparison")
+    require("matplotlib.figure", "A comparison", "plots")
     from sb3_uav.studies.compare.study import Settings, run_study
 
     report_only = settings.pop("report_only")

@@ -1,4 +1,4 @@
-"""``sb3-uav demo``: the whole job on a small scenario in a few minutes."""
+"""``sb3-uav demo``: training, evaluation and figures for a small scenario in a few minutes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.optional import require
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id
+from sb3_uav.zoo.dependencies import require_zoo
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,6 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     args, train_args = parser.parse_known_args(argv)
 
+    # Report missing packages before the training.
+    require_zoo("The demo", "rich.console", "tensorboard")
+    require("matplotlib.figure", "The demo", "plots")
     from sb3_uav.studies.demo import evaluate_run, newest_run
     from sb3_uav.zoo.train import train
 
@@ -36,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
             *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
             *("--eval-freq", "1000000", "--eval-episodes", "50"),
-            # Networks this small gain little from a second thread, and lose much when another process needs the core.
+            # Networks this small gain little from a second thread, and lose much if another process needs the core.
             *("--num-threads", "1"),
             *(["--progress"] if sys.stdout.isatty() else []),
             *train_args,

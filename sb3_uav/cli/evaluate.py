@@ -19,7 +19,8 @@ OK, INFEASIBLE, USER_ERROR, FAILED = 0, 1, 2, 3
 EPILOG = """\
 solvers:
   An unknown NAME makes the error message list all solvers, an unknown KEY all options of that solver.
-  NAME:KEY=VALUE,... sets options of a solver; name=TEXT is how tables and files call it. Trained zips are solvers too:
+  NAME:KEY=VALUE,... sets options of a solver; name=TEXT is its label in tables and files. A value with a comma stands in
+  quotes, which the shell must leave alone: 'dl-drl:allocator="a,b.zip",router=r.zip'. Trained zips are solvers too:
     dl-drl:allocator=A.zip,router=R.zip,decode=sampling,samples=128      a trained pair
     dl-drl-i:allocator=A.zip,router=R.zip                                the same, named as in the paper (independent training)
     kmeans-am:router=R.zip                                               K-means and a trained router
@@ -28,18 +29,21 @@ files in DIR:
   results.csv, schedules.jsonl    one line per solver and instance, written as soon as it is known
   summary.csv, summary.json       the table, with more columns
   evaluation.json                 solvers, hashes of instances and zips, seeds, versions of packages
-  The same call goes on where an interrupted one stopped, and further calls add solvers, time limits and seeds.
+  Rerun the same command to resume an interrupted run; further runs add solvers, time limits and seeds.
 
 exit code:
   0    all schedules are feasible
   1    a schedule was infeasible, or a solver proved a bound that is wrong
-  2    the input was wrong, and nothing was run
-  3    a solver or its licence is missing, or it refused the instances or its time limit, or failed; others are complete
+  2    the input was wrong, or no solver could be made, and nothing was run
+  3    a solver or its license is missing, or its options are wrong, or it refused the instances or its time limit, or
+       failed; the others are complete
   130  interrupted by Ctrl-C
 """
 
 
 def make_parser() -> argparse.ArgumentParser:
+    from sb3_uav.solvers.decoding import DECODINGS
+
     parser = argparse.ArgumentParser(
         prog="sb3-uav evaluate",
         description="Evaluate trained pairs and other solvers on the same instances. Every schedule is checked\n"
@@ -68,15 +72,15 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="start anew, instead of going on with the results in DIR")
+    parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
     networks = parser.add_argument_group("networks")
     networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
     networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
     pair = parser.add_argument_group("a trained pair, the first of the solvers")
     pair.add_argument("--allocator", type=Path, metavar="ZIP", help="SB3 zip of the allocator (needs --router)")
     pair.add_argument("--router", type=Path, metavar="ZIP", help="SB3 zip of the router (needs --allocator)")
-    pair.add_argument("--decode", choices=("greedy", "sampling"), default="greedy", help="default: %(default)s")
-    pair.add_argument("--samples", type=int, default=128, help="allocations per instance with sampling, default: %(default)s")
+    pair.add_argument("--decode", choices=DECODINGS, default="greedy", help="default: %(default)s")
+    pair.add_argument("--samples", type=int, default=128, help="tours per UAV unless greedy, default: %(default)s")
     pair.add_argument("--untrained", action="store_true", help="add the same networks before any training")
     return parser
 
@@ -101,10 +105,10 @@ def load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
 def make_solvers(args: argparse.Namespace) -> list[Solver]:
     """
     :param args: Of ``sb3-uav evaluate``
-    :return: The solvers that they ask for, the trained pair first; in place of one whose package or licence is missing, or
-        whose time limit is 0, one that refuses all instances
-    :raises FileNotFoundError: If a zip is missing
-    :raises ValueError: If a zip is damaged, or another argument is not allowed
+    :return: The solvers that they ask for, the trained pair first; in place of one that cannot be made, one that refuses all
+        instances
+    :raises OSError: If a zip of the trained pair is missing, or of the only solver
+    :raises ValueError: If a zip of it is damaged, or another argument is not allowed
     """
     from sb3_uav.solvers import make_solver
     from sb3_uav.solvers.unavailable import UnavailableError, UnavailableSolver
@@ -120,13 +124,18 @@ def make_solvers(args: argparse.Namespace) -> list[Solver]:
         solvers += [trained, trained.untrained(args.seed)] if args.untrained else [trained]
     elif args.untrained:
         raise ValueError("--untrained needs --allocator and --router, which say what the networks look like.")
+    wrong: list[Exception] = []
     for spec in args.solvers:
         try:
             solvers.append(make_solver(spec, device=args.device, batch_size=args.batch_size))
-        except (ImportError, UnavailableError) as error:
+        except (ImportError, ValueError, OSError) as error:
+            # The others can do without it.
             solvers.append(UnavailableSolver(spec, str(error)))
+            wrong += [] if isinstance(error, ImportError | UnavailableError) else [error]
     if not solvers:
         raise ValueError("There is nothing to evaluate: give --allocator with --router, or --solvers.")
+    if wrong and all(isinstance(solver, UnavailableSolver) for solver in solvers):
+        raise wrong[0]
     return solvers
 
 
@@ -214,7 +223,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 resume=not args.overwrite,
             )
     except KeyboardInterrupt:
-        print(f"sb3-uav: {args.out} holds the results so far; the same command goes on from there.", file=sys.stderr)
+        print(f"sb3-uav: {args.out} holds the results so far; run the same command again to resume.", file=sys.stderr)
         raise
     print_table(summary)
     # A solver that uses no time limit stands in the summary of each.

@@ -16,7 +16,7 @@ FORWARDED = {
     "train": ("sb3_uav.cli.train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
     "enjoy": ("sb3_uav.cli.enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
     "evaluate": ("sb3_uav.cli.evaluate", "evaluate zips and solvers on the same instances"),
-    "anytime": ("sb3_uav.cli.anytime", "draw what an evaluation found against the time it took"),
+    "anytime": ("sb3_uav.cli.anytime", "draw objective against time from an evaluation"),
     "reproduce": ("sb3_uav.cli.reproduce", "make the tables and figures of the paper"),
     "compare": ("sb3_uav.cli.compare", "train algorithms at an equal budget and compare them"),
     "demo": ("sb3_uav.cli.demo", "train and evaluate a small scenario in a few minutes"),

@@ -12,21 +12,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_uav.studies.reproduce.scales import SCALES
-from sb3_uav.studies.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
+from sb3_uav.common.optional import require
+from sb3_uav.reproduce.scales import SCALES
+from sb3_uav.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
+from sb3_uav.zoo.dependencies import require_zoo
 
 if TYPE_CHECKING:
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.session import Session
 
 EPILOG = """\
 what is written:
   DIR/table1.md, .tex, .csv       the table, the paper's figures beside ours; the same for the data of figures
-  DIR/fig3.png, .pdf              the figure; fig4_curves.csv and fig5_curves.csv hold every epoch
+  DIR/fig3.png, .pdf              the figure, drawn from fig3_schedules.csv, fig4_curves.csv, fig5_curves.csv or its own table
   DIR/models/U4-N80/ITS/          allocator.zip, router.zip, its_log.csv, training.json of each pair that was trained
   DIR/training/, DIR/timing/      the zoo's own folders of the trainings; the runs that Table I times
   DIR/evaluations/                results.csv and schedules.jsonl of every situation
-  Every file says by which command, scale, seed and versions it was made, and what was left out.
-  Trainings and evaluations go on where an interrupted call stopped, and share what they have in common.
+  Every file states the command, scale, seed and versions that it was made with, and what was left out.
+  Rerun an interrupted call to resume it; tables and figures share trainings and evaluations.
 
 --models DIR:
   DIR/U4-N80/ITS/allocator.zip and router.zip; its_log.csv of the training for table1, fig4 and fig5. In place of
@@ -35,11 +37,11 @@ what is written:
 """
 
 
-def indented(name: str, text: str) -> str:
+def _indented(name: str, text: str) -> str:
     """
-    :param name: What is explained
-    :param text: The explanation
-    :return: Both as argparse prints options
+    :param name: Name of a scale
+    :param text: Its description
+    :return: Both in the layout of argparse
     """
     return textwrap.fill(f"  {name:<22}{text}", 100, subsequent_indent=" " * 24)
 
@@ -47,32 +49,32 @@ def indented(name: str, text: str) -> str:
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav reproduce",
-        description="Make tables and figures of the DL-DRL paper anew: train the pairs that are missing, evaluate them beside "
+        description="Reproduce tables and figures of the DL-DRL paper: train missing pairs, evaluate them beside "
         "the paper's baselines, and write our figures beside the paper's.",
-        epilog="\n".join(["scales:", *(indented(scale.name, scale.text) for scale in SCALES.values()), "", EPILOG]),
+        epilog="\n".join(["scales:", *(_indented(scale.name, scale.text) for scale in SCALES.values()), "", EPILOG]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "targets", nargs="+", choices=(*TARGETS, "all"), metavar="TARGET", help=f"{', '.join(TARGETS)}, or all"
     )
-    parser.add_argument("--scale", choices=tuple(SCALES), default="smoke", help="how much of it (default: %(default)s)")
+    parser.add_argument("--scale", choices=tuple(SCALES), default="smoke", help="size of the study (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of all files (default: reproduction/SCALE)")
     parser.add_argument("--models", type=Path, metavar="DIR", help="use the trained pairs in DIR (see below)")
-    parser.add_argument("--no-training", action="store_true", help="leave out what would have to be trained first")
+    parser.add_argument("--no-training", action="store_true", help="leave out results that need further training")
     parser.add_argument(
         "--solvers",
         nargs="*",
         default=list(DEFAULT_SOLVERS),
         metavar="NAME",
-        help="solvers that are not trained here; others than the paper's become further columns, e.g. pyvrp "
+        help="solvers that are not trained here; solvers that the paper does not have become further columns, e.g. pyvrp "
         f"(default: {' '.join(DEFAULT_SOLVERS)})",
     )
     parser.add_argument(
         "--exact-backend",
         choices=("highs", "gurobi"),
-        help="which solver stands for the paper's Gurobi (default: the scale's; gurobi at scale paper)",
+        help="backend that stands for the paper's Gurobi (default: the scale's; gurobi at scale paper)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of trainings, test instances and solvers (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of trainings and solvers (default: %(default)s)")
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N", help="trainings, and instances of solvers, at once (default: %(default)s)"
     )
@@ -81,9 +83,14 @@ def make_parser() -> argparse.ArgumentParser:
         "--num-threads",
         type=int,
         metavar="N",
-        help="of torch, in each training (default: its own choice; 1 with several jobs)",
+        help="torch threads of each training (default: chosen by torch; 1 with several jobs)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="evaluate anew; trained pairs are kept")
+    parser.add_argument(
+        "--redraw",
+        action="store_true",
+        help="train and evaluate nothing: write the tables and figures in --out again from the CSV files in it",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="discard existing evaluations; trained pairs are kept")
     return parser
 
 
@@ -101,44 +108,50 @@ def main(argv: Sequence[str] | None = None) -> int:
         if value is not None and value < least:
             raise ValueError(f"{name} is {value}; it must be at least {least}.")
     check_solvers(args.solvers)
-    # What may be missing is found before the long run, not after it.
-    from sb3_uav.cli.evaluate import ProgressLines
-    from sb3_uav.envs.render import require_matplotlib
-
-    require_matplotlib()
+    # Report missing packages before the long run.
+    require("matplotlib.figure", "Reproducing the paper's figures", "plots")
     names = [name for name in TARGETS if name in args.targets or "all" in args.targets]
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     out = args.out or Path("reproduction") / args.scale
+    if args.redraw:
+        from sb3_uav.reproduce.output_files import redraw
+
+        for path in redraw(out, names):
+            print(path)
+        return 0
+    require_zoo("Reproducing the paper's tables")
+    from sb3_uav.cli.evaluate import ProgressLines
+
     try:
         with ProgressLines() as progress:
-            session = make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
+            session = _make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
             for position, name in enumerate(names):
                 print(f"{name} ({position + 1} of {len(names)}), scale {args.scale}", file=sys.stderr, flush=True)
                 for path in target_functions()[name](session):
                     print(path, flush=True)
     except KeyboardInterrupt:
-        print(f"sb3-uav: {out} holds what is done so far; the same command goes on from there.", file=sys.stderr)
+        print(f"sb3-uav: {out} holds the results so far; rerun the command to resume.", file=sys.stderr)
         raise
     return 0
 
 
-def make_session(
+def _make_session(
     args: argparse.Namespace, out: Path, command: str, progress: Callable[[str, int, int], None] | None
 ) -> Session:
     """
-    :param args: Of ``sb3-uav reproduce``
+    :param args: Arguments of ``sb3-uav reproduce``
     :param out: Folder of all results
-    :param command: What the user typed
+    :param command: The command line
     :param progress: Called before each solver starts and after each of its instances
-    :return: What all tables and figures share
+    :return: The session
     :raises FileNotFoundError: If the folder of models is missing
     """
     import torch as th
 
-    from sb3_uav.studies.reproduce.evaluator import Evaluator
-    from sb3_uav.studies.reproduce.origin import Origin
-    from sb3_uav.studies.reproduce.pairs import Models
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.evaluator import Evaluator
+    from sb3_uav.reproduce.origin import Origin
+    from sb3_uav.reproduce.pairs import Models
+    from sb3_uav.reproduce.session import Session
 
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)
@@ -149,4 +162,4 @@ def make_session(
         scale, out, args.models, args.seed, args.device, args.num_threads, args.jobs, training=not args.no_training
     )
     evaluator = Evaluator(scale, out, args.seed, args.device, args.jobs, args.overwrite, progress)
-    return Session(scale, models, evaluator, args.solvers, Origin(command, scale, args.seed), out)
+    return Session(scale, models, evaluator, args.solvers, Origin.of(command, scale, args.seed), out)

@@ -1,4 +1,4 @@
-"""What every command does with an error: one line on the standard error and an exit code."""
+"""Error handling of all commands: one line on the standard error and an exit code."""
 
 from __future__ import annotations
 

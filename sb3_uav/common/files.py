@@ -1,4 +1,4 @@
-"""Files that are whole at any moment, and their digests."""
+"""Files that are complete at any moment, and their digests."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any, TextIO
 @contextmanager
 def temporary_name(path: Path) -> Iterator[Path]:
     """
-    Give a file another name while it is written, and rename it once the ``with`` block ends without an exception.
+    Write a file under a temporary name, which is replaced by the final one if the ``with`` block ends without an exception.
 
     :param path: The file to write; its folder is created if missing
     :return: The temporary path, in the same folder and with the same suffix
-    :raises OSError: If the file cannot be written; an older file of this name is then untouched
+    :raises OSError: If the file cannot be written; an existing file of this name is then left untouched
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.tmp{path.suffix}")
@@ -33,7 +33,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """
     :param path: The file to write; its folder is created if missing
     :param content: The content of the file; text is encoded as UTF-8
-    :raises OSError: If the file cannot be written; an older file of this name is then untouched
+    :raises OSError: If the file cannot be written; an existing file of this name is then left untouched
     """
     with temporary_name(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -42,11 +42,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 @contextmanager
 def replaced_when_complete(path: Path) -> Iterator[TextIO]:
     """
-    Open a text file for writing that replaces an older one only when the ``with`` block ends without an exception.
+    Open a text file for writing; it replaces an existing one only if the ``with`` block ends without an exception.
 
     :param path: The file to write; its folder is created if missing
-    :return: The opened file, without translation of line ends
-    :raises ValueError: If the file cannot be opened there
+    :return: The open file, without translation of line endings
+    :raises ValueError: If the file cannot be written there
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,8 +59,8 @@ def replaced_when_complete(path: Path) -> Iterator[TextIO]:
 def write_csv(file: TextIO, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     """
     :param file: A file opened with ``newline=""``
-    :param columns: Cells of the first line
-    :param rows: Cells of the other lines; None becomes an empty cell
+    :param columns: Cells of the header
+    :param rows: Cells of the other rows; None becomes an empty cell
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(columns)

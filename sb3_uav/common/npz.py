@@ -2,26 +2,78 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
-import zlib
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
-# What numpy and zipfile raise on damaged files: the last on headers that ask for encryption or an unknown compression.
-UNREADABLE = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError)
+# Upper bound of the compression ratio of deflate, which np.savez_compressed uses (https://zlib.net/zlib_tech.html).
+GREATEST_COMPRESSION = 1032
+SUFFIX = ".npy"
 
 
 def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
     """
-    :param path: An ``.npz`` file that exists
-    :param advice: What the user should do if it is damaged, the end of the message
-    :return: Its arrays by name
+    Read all arrays of a file. Memory is allocated only for data that the file can contain, whatever its headers declare.
+
+    :param path: An existing ``.npz`` file
+    :param advice: What the user should do if the file is damaged; ends the message
+    :return: The arrays by name
     :raises ValueError: If it is not an intact ``.npz``, or holds anything but plain arrays
     """
+    place = ""
     try:
         # Not np.load(path), which would also read a .npy or offer to unpickle whatever else it finds.
-        with path.open("rb") as stream, np.lib.npyio.NpzFile(stream, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except UNREADABLE as error:
-        raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); {advice}.") from error
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as file:
+            arrays = {}
+            for member in file.infolist():
+                place = f"array '{member.filename.removesuffix(SUFFIX)}': "
+                arrays[member.filename.removesuffix(SUFFIX)] = _read_array(file, member)
+            return arrays
+    except Exception as error:
+        # Given damaged bytes, zipfile and numpy's header parser (tokenize, ast) raise almost any exception, even MemoryError.
+        found = str(error) or type(error).__name__
+        raise ValueError(f"{path}: not an intact .npz of plain arrays ({place}{found}); {advice}.") from error
+
+
+def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """
+    :param file: An opened archive
+    :param member: One of its files
+    :return: The array in it
+    :raises Exception: Any kind of exception, if the file is damaged or not an array
+    """
+    if not member.filename.endswith(SUFFIX):
+        raise ValueError("the name does not end in .npy")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("it is compressed in a way that numpy does not use")
+    if member.file_size > GREATEST_COMPRESSION * member.compress_size + 1:
+        raise ValueError(
+            f"{member.compress_size} compressed bytes cannot hold the {member.file_size} bytes that the archive declares"
+        )
+    with file.open(member) as stream:
+        shape, dtype = _read_header(stream)
+        n_bytes = member.file_size - stream.tell()
+    # Arrays of objects are pickles, which read_array refuses.
+    if not dtype.hasobject and (dtype.itemsize == 0 or math.prod(shape) * dtype.itemsize != n_bytes):
+        raise ValueError(f"the header declares {dtype} of shape {shape}, but {n_bytes} bytes follow")
+    with file.open(member) as stream:
+        array: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
+        return array
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """
+    :param stream: The content of an ``.npy`` file
+    :return: The shape and the dtype that it declares
+    """
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    elif version == (2, 0):
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+    else:
+        raise ValueError(f"version {version} of the .npy format is only for structured arrays")
+    return shape, dtype

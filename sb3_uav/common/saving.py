@@ -1,4 +1,4 @@
-"""Saving algorithms so that an interruption or a full disk never costs the previous file."""
+"""Saves algorithms so that an interruption or a full disk never destroys the previous file."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def save_atomically(
     include: Iterable[str] | None = None,
 ) -> None:
     """
-    SB3's ``save``, under a temporary name that is renamed when the zip is complete.
+    Save as SB3's ``save`` does, under a temporary name that is replaced by the final one when the zip is complete.
 
     :param model: Any SB3 algorithm
     :param path: The zip to write; ``.zip`` is appended when missing
     :param exclude: Attributes to leave out
     :param include: Attributes to save although they are left out by default
-    :raises OSError: If the file cannot be written; an older one of the same name is then untouched
+    :raises OSError: If the file cannot be written; an existing file of the same name is then left untouched
     """
     if not isinstance(path, str | pathlib.Path):
         BaseAlgorithm.save(model, path, exclude, include)

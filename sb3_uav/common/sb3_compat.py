@@ -1,7 +1,7 @@
 """
-The one place that touches private attributes of Stable-Baselines3's objects from outside.
+Access to private attributes of Stable-Baselines3's objects from outside a subclass; no other module does that.
 
-Overriding a documented hook in a subclass is not listed here. Each function links the upstream code that it relies on.
+Each function links the upstream code that it relies on.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def n_updates(model: BaseAlgorithm) -> int:
 
 def total_timesteps(model: BaseAlgorithm) -> int:
     """
-    The number of steps at which the running ``learn`` stops.
+    Number of steps at which the running ``learn`` stops.
 
     ``_setup_learn`` in https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
 
@@ -40,13 +40,13 @@ def total_timesteps(model: BaseAlgorithm) -> int:
 
 def set_last_observation(model: OnPolicyAlgorithm, observation: np.ndarray | dict[str, np.ndarray]) -> None:
     """
-    Tell an algorithm that its environment has been reset from outside.
+    Continue from the first observation of an environment that was reset by other code than the algorithm.
 
     ``_setup_learn`` does the same after its own reset:
     https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
 
     :param model: An on-policy algorithm
-    :param observation: What ``reset`` of its environment returned
+    :param observation: The observation that ``reset`` of its environment returned
     """
     model._last_obs = observation
     model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
@@ -66,7 +66,7 @@ def forget_last_observation(model: OnPolicyAlgorithm) -> None:
 
 def constructor_parameters(policy: BasePolicy) -> dict[str, Any]:
     """
-    The arguments that build another policy of the same architecture.
+    The constructor arguments of another policy of the same architecture.
 
     ``BaseModel._get_constructor_parameters``, used by ``save`` and ``load`` of policies:
     https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/policies.py

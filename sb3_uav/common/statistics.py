@@ -8,7 +8,7 @@ from statistics import NormalDist
 import numpy as np
 
 CONFIDENCE = 0.95
-# 97.5 % quantiles for 1 to 9 degrees of freedom as tables print them, where the expansion of student_t_quantile is not exact.
+# Tabulated 97.5 % quantiles for 1 to 9 degrees of freedom, where the expansion in student_t_quantile is not accurate.
 FEW_DEGREES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
@@ -16,8 +16,8 @@ def student_t_quantile(probability: float, degrees: int) -> float:
     """
     Quantile of Student's t distribution by the Cornish-Fisher expansion around the normal one.
 
-    PyTorch and NumPy have no such function, and SciPy is not a dependency of the core. Off by less than 0.001 at the usual
-    significance levels from 10 degrees of freedom on (Abramowitz and Stegun, 26.7.5).
+    PyTorch and NumPy have no such function, and SciPy is not a dependency of the core. The error is below 0.001 at the usual
+    significance levels for 10 or more degrees of freedom (Abramowitz and Stegun, 26.7.5).
 
     :param probability: Probability below the quantile, between 0 and 1
     :param degrees: Degrees of freedom
@@ -43,7 +43,7 @@ def confidence_quantile(degrees: int) -> float:
 
 def confidence_halfwidth(samples: np.ndarray) -> np.ndarray:
     """
-    Half of the 95 % confidence interval of a mean: that of the paired t-test, if the samples are paired differences.
+    Half-width of the 95 % confidence interval of a mean; for paired differences, the interval of the paired t-test.
 
     :param samples: ``(n, ...)``
     :return: ``(...)``, ``t * s / sqrt(n)``, where t is the 97.5 % quantile of Student's t distribution with n - 1 degrees of

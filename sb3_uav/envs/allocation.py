@@ -1,4 +1,4 @@
-"""Task allocation (the paper's upper level): every task, one a step, is given to a UAV."""
+"""Task allocation (the paper's upper level): each step assigns one task to a UAV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import sweep_order
@@ -23,7 +23,7 @@ TASK_ORDERS = ("input", "sweep")
 
 class AllocationState(NamedTuple):
     """
-    :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` while it has none
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` if it has none yet
     :param task: ``(batch, n_samples)`` int64, index of the task to allocate next
     :param done: ``(batch, n_samples)`` bool, True when every real task has a UAV
     :param action_mask: ``(batch, n_samples, n_uavs)`` bool; any UAV may take any task
@@ -39,7 +39,7 @@ class AllocationDynamics(Dynamics):
     """
     Transitions of task allocation (paper, section IV-A1).
 
-    The one reward, at the end, is the value of the tasks that the router's tours visit.
+    The only reward, at the end, is the total value of the tasks on the router's tours.
 
     :param instances: The instances
     :param router: Plans the tours of the reward
@@ -58,7 +58,8 @@ class AllocationDynamics(Dynamics):
             assignment=th.full((batch_size, n_samples, n_tasks), UNASSIGNED, dtype=th.int64, device=device),
             task=task,
             done=task >= self._n_real,
-            action_mask=th.ones(batch_size, n_samples, self.instances.n_uavs, dtype=th.bool, device=device),
+            # Expanded, as the fleet may be absurdly large.
+            action_mask=th.ones(1, dtype=th.bool, device=device).expand(batch_size, n_samples, self.instances.n_uavs),
         )
 
     def step(self, state: AllocationState, actions: th.Tensor) -> tuple[AllocationState, th.Tensor]:
@@ -72,14 +73,14 @@ class AllocationDynamics(Dynamics):
         rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
         rows = finished.any(1)
         if rows.any():
-            value = plan_tours(self.instances[rows], assignment[rows], self.router).value
+            value = planned_value(self.instances[rows], assignment[rows], self.router)
             rewards[rows] = value.where(finished[rows], 0.0)
         return AllocationState(assignment, task, done, state.action_mask), rewards
 
 
 class Subsets(NamedTuple):
     """
-    :param instances: ``batch * n_samples * n_uavs`` single-UAV instances, one for every UAV of every allocation
+    :param instances: ``batch * n_samples * n_uavs`` single-UAV instances, one per UAV of each allocation
     :param task_index: ``(batch * n_samples * n_uavs, n_slots)`` int64, the task of the original instance in each slot
     """
 
@@ -89,7 +90,7 @@ class Subsets(NamedTuple):
 
 def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     """
-    Cut instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
+    Split instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64; tasks with ``UNASSIGNED`` and padded tasks are left out
@@ -102,11 +103,11 @@ def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     order = key.argsort(dim=-1, stable=True)
     counts = th.zeros(batch_size, n_samples, n_uavs + 1, dtype=th.int64, device=key.device)
     counts = counts.scatter_add(-1, key, th.ones_like(key))[..., :n_uavs]
-    n_slots = max(int(counts.max()), 1)
+    n_slots = max(int(counts.max()), 1) if len(instances) > 0 else 1
     slots = th.arange(n_slots, device=key.device)
     start = counts.cumsum(-1) - counts
     position = (start[..., None] + slots).clamp(max=n_tasks - 1)
-    task_index = order.gather(-1, position.flatten(2)).view(batch_size, -1)
+    task_index = order.gather(-1, position.flatten(2)).flatten(1)
     task_mask = (slots < counts[..., None]).view(-1, n_slots)
 
     def per_uav(field: th.Tensor) -> th.Tensor:
@@ -136,19 +137,48 @@ class PlannedTours(NamedTuple):
 
 def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> PlannedTours:
     """
-    Let the router plan every UAV's tour over the tasks it was given.
+    Plan every UAV's tour over its assigned tasks with a router.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
-    :return: The tours and what they collect
+    :return: The tours and the value that they collect
     """
     shape = (*assignment.shape[:2], instances.n_uavs)
     subsets = split_tasks(instances, assignment)
     nodes = router(subsets.instances).to(assignment.device)
     value = collected_value(subsets.instances, nodes).view(shape).sum(-1)
     tours = subsets.task_index.gather(1, (nodes - 1).clamp(min=0)).masked_fill(nodes == DEPOT, -1)
-    return PlannedTours(tours.view(*shape, -1), value)
+    return PlannedTours(tours.view(*shape, nodes.shape[1]), value)
+
+
+def useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
+    """
+    Remove UAVs that cannot have a task, so that an absurdly large fleet takes no memory.
+
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64
+    :return: Both unchanged if there are at most as many UAVs as tasks. Otherwise the instances with one UAV per task, and the
+        assignment with the UAVs that have tasks renumbered from 0 in the same order
+    """
+    if instances.n_uavs <= instances.n_tasks:
+        return instances, assignment
+    left_out = (assignment == UNASSIGNED) | ~instances.task_mask[:, None]
+    sorted_uavs, order = assignment.masked_fill(left_out, instances.n_uavs).sort(dim=-1)
+    number = th.zeros_like(assignment)
+    number[..., 1:] = (sorted_uavs[..., 1:] != sorted_uavs[..., :-1]).cumsum(-1)
+    numbered = number.scatter(-1, order, number).masked_fill(left_out, UNASSIGNED)
+    return replace(instances, n_uavs=instances.useful_fleet), numbered
+
+
+def planned_value(instances: Instances, assignment: th.Tensor, router: Router) -> th.Tensor:
+    """
+    :param instances: ``batch`` instances
+    :param assignment: ``(batch, n_samples, n_tasks)`` int64
+    :param router: Plans one tour per row
+    :return: ``(batch, n_samples)`` float64, total value of the tasks on the planned tours
+    """
+    return plan_tours(*useful_allocation(instances, assignment), router).value
 
 
 def schedules(tours: th.Tensor) -> list[Schedule]:
@@ -161,13 +191,15 @@ def schedules(tours: th.Tensor) -> list[Schedule]:
 
 class AllocationProblem(Problem):
     """
-    Task allocation: one task is given to a UAV per step; the reward comes at the end.
+    Task allocation: each step assigns one task to a UAV; the reward comes at the end.
 
     :param generator: Draws the instances
     :param router: Plans the tours of the reward; nearest feasible task when None
-    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot
-    :raises ValueError: If there is no such order
+    :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot
+    :raises ValueError: If the order is unknown
     """
+
+    running_stage = Stage.ASSIGNING
 
     def __init__(self, generator: InstanceGenerator, router: Router | None = None, task_order: str = "input") -> None:
         super().__init__(generator)
@@ -176,7 +208,7 @@ class AllocationProblem(Problem):
 
     @property
     def task_order(self) -> str:
-        """In which order the tasks are shown."""
+        """The order in which the tasks are presented."""
         return self._task_order
 
     @task_order.setter
@@ -200,7 +232,7 @@ class AllocationProblem(Problem):
         }
 
     def dynamics(self, instances: Instances) -> AllocationDynamics:
-        # Looked up at every step, so that a router set during an episode is used.
+        # Looked up at every call, so that a router set during an episode takes effect.
         return AllocationDynamics(instances, lambda subsets: self.router(subsets))
 
     def observe(self, dynamics: AllocationDynamics, state: AllocationState) -> dict[str, th.Tensor]:
@@ -211,7 +243,7 @@ class AllocationProblem(Problem):
         }
 
     def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        return plan_tours(instances, actions, self.router).value
+        return planned_value(instances, actions, self.router)
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
         rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
@@ -219,16 +251,18 @@ class AllocationProblem(Problem):
         return rewards.scatter(-1, last[..., None], returns[..., None])
 
     def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        # An instance without tasks is over only after a first step, which finds nothing to do.
+        # An instance without tasks ends only after a first step that does nothing.
         return instances.task_mask.sum(1).clamp(min=1)[:, None].expand(actions.shape[:2])
 
     def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
-        # Until the end there are no tours: draw the tasks of each UAV in the order in which it got them.
+        assignment = np.full((1, 1, instance.n_tasks), UNASSIGNED)
+        assignment[0, 0, : len(actions)] = actions
+        instance, allocation = useful_allocation(instance, th.from_numpy(assignment))
+        # There are no tours before the end: these are the tasks of each UAV, in the order of their assignment.
         if len(actions) < int(instance.task_mask.sum()):
-            return [[task for task, uav in enumerate(actions) if uav == v] for v in range(instance.n_uavs)]
-        assignment = th.full((1, 1, instance.n_tasks), UNASSIGNED)
-        assignment[0, 0, : len(actions)] = th.tensor(actions)
-        planned = plan_tours(instance, assignment, self.router)
+            uavs = allocation[0, 0].tolist()
+            return [[task for task, uav in enumerate(uavs) if uav == v] for v in range(instance.n_uavs)]
+        planned = plan_tours(instance, allocation, self.router)
         return [list(route) for route in schedules(planned.tours[:, 0])[0].routes]
 
 
@@ -243,8 +277,8 @@ class TaskAllocationEnv(ProblemEnv):
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances
     :param router: Plans the tours of the reward; nearest feasible task when None
-    :param task_order: ``"input"``, or ``"sweep"`` to show the tasks in the order of a sweep around the depot, as allocators
-        with ``sweep`` want them
+    :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot, which
+        allocators with ``sweep`` expect
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
     """
 
@@ -266,9 +300,9 @@ class TaskAllocationEnv(ProblemEnv):
         super().__init__(AllocationProblem(generator, router, task_order), render_mode)
 
     def set_router(self, router: Router) -> None:
-        """Use another router from the next reward on."""
+        """Use another router, starting with the next reward."""
         self.problem.router = router
 
     def set_task_order(self, task_order: str) -> None:
-        """Show the tasks of the next episodes in another order."""
+        """Present the tasks of the next episodes in another order."""
         self.problem.task_order = task_order

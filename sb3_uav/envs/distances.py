@@ -1,10 +1,10 @@
-"""Distances in float64, and the one tolerance of the maximum flight distance."""
+"""Euclidean distances, and the tolerance of the maximum flight distance."""
 
 from __future__ import annotations
 
 import torch as th
 
-# One tolerance for the dynamics and for the checker, relative to the maximum flight distance.
+# Rounding tolerance of the dynamics and the checker, relative to the maximum flight distance.
 DISTANCE_TOLERANCE = 5e-10
 
 
@@ -12,7 +12,7 @@ def euclidean(a: th.Tensor, b: th.Tensor) -> th.Tensor:
     """
     Euclidean distance over the last dimension.
 
-    Written out, so that every driver and batch size rounds alike.
+    Written out so that rounding does not depend on the driver or the batch size.
 
     :param a: ``(..., 2)``
     :param b: ``(..., 2)``, broadcast against ``a``

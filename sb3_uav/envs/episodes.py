@@ -1,4 +1,4 @@
-"""Episodes of a problem that run in lock step: the stateful part of the environments."""
+"""Episodes of a problem, run in lock step: the stateful part of the environments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 
 
 class StepResult(NamedTuple):
@@ -25,7 +25,7 @@ class StepResult(NamedTuple):
 
 class Episodes:
     """
-    ``n_envs`` episodes of a problem, stepped together; the one stateful piece under the Gymnasium and the vectorized env.
+    ``n_envs`` episodes of a problem, stepped together. The Gymnasium and the vectorized environment are both built on it.
 
     Row ``i`` draws its instances from its own random generator, so that a batch of rows seeded ``s, s + 1, ...`` plays the
     same episodes as single environments with these seeds.
@@ -53,7 +53,7 @@ class Episodes:
         Start new episodes.
 
         :param rows: Indices of the rows to reset; all when None
-        :param given: Instances (batches of one) to use for some rows instead of drawn ones
+        :param given: Instances (batches of one) to use for some rows instead of drawing them
         """
         given = given or {}
         indices = np.arange(self.n_envs) if rows is None else np.asarray(rows)
@@ -78,7 +78,7 @@ class Episodes:
         self._static_observation = {key: value.numpy() for key, value in static.items()}
 
     def _fit(self, instances: Instances) -> Instances:
-        """Pad to the size of the observation space, and refuse what does not fit."""
+        """Pad to the size of the observation space; raise ValueError if the instance does not fit."""
         n_tasks, n_uavs = self.problem.generator.n_tasks, self.problem.generator.n_uavs
         if self.problem.uses_fleet and instances.n_uavs != n_uavs:
             raise ValueError(
@@ -95,13 +95,15 @@ class Episodes:
     def step(self, actions: np.ndarray) -> StepResult:
         """
         :param actions: ``(n_envs,)`` integers
-        :return: What follows; finished rows are not reset here
+        :return: Observations, rewards, ends of episodes and illegal actions; finished rows are not reset
         """
         if self.state is None:
             raise ResetNeeded("There is no episode to step yet; call reset() first.")
         given = np.asarray(actions)
         n_actions = self.state.action_mask.shape[-1]
-        if given.size != self.n_envs or not np.isin(given, np.arange(n_actions)).all():
+        # Not np.isin with all actions, as there may be a million.
+        is_number = given.dtype.kind in "biuf" and given.size == self.n_envs
+        if not is_number or not ((given >= 0) & (given < n_actions) & (given == np.floor(given))).all():
             raise ValueError(
                 f"Give {self.n_envs} whole numbers between 0 and {n_actions - 1} as actions; found {given.tolist()!r:.80}."
             )
@@ -131,6 +133,10 @@ class Episodes:
         """The routes of one row's episode so far, task indices from 0 per UAV."""
         return self.problem.routes(self.instances[row], self._actions[row])
 
+    def stage(self, row: int) -> Stage:
+        """The stage of one row's episode."""
+        return Stage.FINISHED if bool(self.state.done[row].all()) else self.problem.running_stage
+
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""
         return self.state.action_mask[:, 0].numpy().copy()
@@ -138,10 +144,11 @@ class Episodes:
 
 def given_instance(options: dict[str, Any] | None) -> Instances | None:
     """
-    The instance that the ``options`` of a reset ask for.
+    The instance requested by the ``options`` of a reset.
 
     :param options: ``{"instance": Instances}`` with a batch of one, or nothing
-    :raises ValueError: On other keys or types, so that a misspelled option is not ignored
+    :return: The validated instance, or None
+    :raises ValueError: If there are other keys or types, so that a misspelled option is not ignored
     """
     if not options:
         return None

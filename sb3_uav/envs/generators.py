@@ -1,15 +1,16 @@
-"""Sources of instances: distributions, mixtures of sizes, and rows of given instances."""
+"""Generators of instances: distributions, mixtures of sizes, and rows of given instances."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 import torch as th
 
-from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.instances import MAX_UAVS, Instances
 
 
 class InstanceGenerator(Protocol):
@@ -24,7 +25,7 @@ class InstanceGenerator(Protocol):
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
         :param batch_size: Number of instances
-        :param rng: The source of randomness
+        :param rng: Random generator
         :return: ``batch_size`` instances of ``n_tasks`` task slots, float64 on the CPU
         """
         ...
@@ -32,12 +33,15 @@ class InstanceGenerator(Protocol):
 
 def check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
     """
+    :param n_tasks: Number of tasks
+    :param n_uavs: Number of UAVs
+    :param max_distance: Maximum flight distance
     :raises ValueError: If a size is not allowed; the message names it
     """
     if n_tasks < 1:
         raise ValueError(f"n_tasks is {n_tasks}, but an instance needs at least 1 task.")
-    if n_uavs < 1:
-        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV.")
+    if not 1 <= n_uavs <= MAX_UAVS:
+        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV, and {MAX_UAVS} at most.")
     if not (np.isfinite(max_distance) and max_distance > 0):
         raise ValueError(f"max_distance is {max_distance}, but the maximum flight distance must be a finite number > 0.")
 
@@ -47,10 +51,10 @@ def _with_unit_values(depot: np.ndarray, tasks: np.ndarray, max_distance: float,
     return Instances(
         depot=th.from_numpy(depot),
         tasks=th.from_numpy(tasks),
-        values=th.ones(batch_size, n_tasks, dtype=th.float64),
-        max_distance=th.full((batch_size,), max_distance, dtype=th.float64),
+        values=th.ones(batch_size, n_tasks, dtype=th.float64, device="cpu"),
+        max_distance=th.full((batch_size,), max_distance, dtype=th.float64, device="cpu"),
         n_uavs=n_uavs,
-        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool),
+        task_mask=th.ones(batch_size, n_tasks, dtype=th.bool, device="cpu"),
     )
 
 
@@ -80,13 +84,13 @@ class UniformGenerator:
 @dataclass(frozen=True)
 class ClusteredGenerator:
     """
-    Tasks normally distributed around uniform centres, clipped to the unit square; the depot is uniform.
+    Tasks normally distributed around uniform centers, clipped to the unit square; the depot is uniform.
 
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param n_clusters: Number of centres
-    :param spread: Standard deviation around a centre
+    :param n_clusters: Number of centers
+    :param spread: Standard deviation around a center
     :raises ValueError: If a size is not allowed
     """
 
@@ -103,32 +107,33 @@ class ClusteredGenerator:
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         depot = rng.random((batch_size, 2))
-        centres = rng.random((batch_size, self.n_clusters, 2))
+        centers = rng.random((batch_size, self.n_clusters, 2))
         cluster = rng.integers(self.n_clusters, size=(batch_size, self.n_tasks))
         noise = rng.normal(0.0, self.spread, (batch_size, self.n_tasks, 2))
-        tasks = np.clip(np.take_along_axis(centres, cluster[..., None], axis=1) + noise, 0.0, 1.0)
+        tasks = np.clip(np.take_along_axis(centers, cluster[..., None], axis=1) + noise, 0.0, 1.0)
         return _with_unit_values(depot, tasks, self.max_distance, self.n_uavs)
 
 
-# With fewer tasks than these nearly any allocation visits all of them, and there is little to learn.
+# With fewer tasks per UAV, almost every allocation visits all tasks, and there is little to learn.
 TASKS_PER_UAV = 12
-# Small instances teach nearly as much as large ones and cost less, so there are more of them; 1 is uniform in the logarithm.
+# Exponent that favors small instances, which are almost as instructive as large ones and cheaper; 1 is log-uniform.
 SMALL_SIZES = 1.5
-# Not 1, as equally many tasks in all would need: large batches of small tensors waste less time on launching operations.
+# Exponent that reduces the batch size of larger instances. With 1, all batches would hold equally many tasks; less than that
+# is better, because small tensors spend more time on launching operations.
 FEWER_INSTANCES = 0.85
 
 
 @dataclass(frozen=True)
 class MixtureGenerator:
     """
-    Training batches of one random size each: a number of tasks, a fleet of at least 2 UAVs and a maximum flight distance, so
-    that one network learns them all. Depot and tasks are uniform in the unit square.
+    Training batches of random sizes, so that one network learns them all: each batch has its own number of tasks, fleet of at
+    least 2 UAVs, and maximum flight distance. Depot and tasks are uniform in the unit square.
 
-    Called like any other generator, it gives instances of the largest size.
+    Calling the generator directly returns instances of the largest size.
 
     :param n_tasks: Largest number of tasks
     :param n_uavs: Largest fleet
-    :param max_distance: Maximum flight distance of every second batch; of the others 0.6 to 1.6 times as much
+    :param max_distance: Maximum flight distance of half of the batches; the others have 0.6 to 1.6 times as much
     :param min_tasks: Smallest number of tasks
     :raises ValueError: If a size is not allowed
     """
@@ -148,8 +153,8 @@ class MixtureGenerator:
 
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
-        :param batch_size: Number of instances of the smallest size; of larger ones there are fewer
-        :param rng: The source of randomness
+        :param batch_size: Number of instances of the smallest size; batches of larger sizes have fewer
+        :param rng: Random generator
         :return: Instances of a random size
         """
         n_uavs = int(rng.integers(min(2, self.n_uavs), self.n_uavs, endpoint=True))
@@ -163,11 +168,12 @@ class MixtureGenerator:
 
 def training_batch(generator: InstanceGenerator, batch_size: int, rng: np.random.Generator) -> Instances:
     """
-    The instances of one update: what the generator gives, or what it prefers to train on.
+    Draw the instances of one update, with the generator's own ``training_batch`` if it has one.
 
     :param generator: Any generator
-    :param batch_size: Number of instances; a generator of mixed sizes may give another one
-    :param rng: The source of randomness
+    :param batch_size: Number of instances; a generator of mixed sizes may return fewer
+    :param rng: Random generator
+    :return: The instances
     """
     return getattr(generator, "training_batch", generator)(batch_size, rng)
 
@@ -177,10 +183,31 @@ class FixedGenerator:
     """
     Rows of given instances, drawn at random with replacement.
 
+    Two of them are equal if their instances are, so that environments that read the same file play the same problem.
+
     :param instances: The instances to draw from
+    :raises ValueError: If there are none
     """
 
     instances: Instances
+
+    def __post_init__(self) -> None:
+        if len(self.instances) == 0:
+            raise ValueError("There are no instances to draw from; give at least one.")
+
+    # Taken once: it is compared at every update, and the instances are not meant to change.
+    @cached_property
+    def _digest(self) -> str:
+        return self.instances.digest()
+
+    def __eq__(self, other: object) -> bool:
+        # A subclass may draw them differently.
+        if not isinstance(other, FixedGenerator) or type(other) is not type(self):
+            return NotImplemented
+        return self.instances is other.instances or self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
 
     @property
     def n_tasks(self) -> int:
@@ -205,7 +232,7 @@ def make_generator(
     instances: str | os.PathLike[str] | Instances | None = None,
 ) -> InstanceGenerator:
     """
-    The generator that plain-data arguments of an environment describe.
+    Make a generator from the plain-data arguments of an environment.
 
     :param n_tasks: Number of tasks; ignored when ``instances`` is given
     :param n_uavs: Number of UAVs; ignored when ``instances`` is given

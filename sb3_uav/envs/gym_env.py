@@ -1,4 +1,4 @@
-"""The Gymnasium face of a problem: a batch of one, with numpy at the edges."""
+"""The Gymnasium environment of a problem: a batch of one, with numpy at the edges."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class ProblemEnv(gym.Env[Any, Any]):
     """
     One episode of a problem at a time.
 
-    ``reset(options={"instance": instances[i]})`` plays a given instance. The legal actions are in the observation
-    (``action_mask``) and behind :meth:`action_masks`. An illegal action does not raise: it is counted in
-    ``info["illegal_actions"]`` and has the effect that the dynamics give it.
+    ``reset(options={"instance": instances[i]})`` plays a given instance. The legal actions are available in the observation
+    (``action_mask``) and from :meth:`action_masks`. An illegal action does not raise an error: it is counted in
+    ``info["illegal_actions"]``, and the dynamics define its effect.
 
     :param problem: The problem
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
@@ -96,7 +96,7 @@ class ProblemEnv(gym.Env[Any, Any]):
 
         if self._figure is None:
             self._figure = MapFigure(interactive=self.render_mode == "human")
-        self._figure.draw(self.episodes.instances, 0, self.episodes.routes(0))
+        self._figure.draw(self.episodes, 0)
         return self._figure.rgb_array() if self.render_mode == "rgb_array" else self._figure.show()
 
     def close(self) -> None:

@@ -14,9 +14,16 @@ import torch as th
 
 from sb3_uav.common.files import temporary_name
 from sb3_uav.common.npz import read_npz
+from sb3_uav.envs.array_input import advice_on, as_numbers, per_instance, row_index
 from sb3_uav.envs.distances import distance_limit, euclidean
 
-# The tensors of Instances. Digests are taken in this order, and files of results store digests.
+# A depot is far from the origin beyond this many maximum flight distances, of which float32 still resolves 4e-6 there.
+FAR_FROM_ORIGIN = 64.0
+
+# Larger fleets would not fit the integers of files and solvers.
+MAX_UAVS = 2**31 - 1
+
+# The tensors of Instances. The order matters for digests, which result files store.
 TENSOR_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 
 
@@ -25,14 +32,16 @@ class Instances:
     """
     A batch of problem instances: one depot, ``n_tasks`` tasks and ``n_uavs`` identical UAVs each.
 
-    Coordinates are float64, so that feasibility is decided at that precision; networks work on ``float()`` copies.
-    Rows with fewer tasks are padded at the end, and ``task_mask`` says which tasks are real. The constructor checks shapes
-    only, because the hot loops build subsets by the thousand; :meth:`validate` checks the contents, and
-    :meth:`from_arrays` and :meth:`load` call it.
+    All numbers are float64, so that feasibility is decided at that precision. Coordinates converted from float32 keep their
+    rounding errors: pass float64 coordinates, especially far from the origin. Networks use float32 copies of
+    :meth:`near_origin`.
+    Rows with fewer tasks are padded at the end, and ``task_mask`` marks the real tasks. The constructor checks only shapes,
+    because the hot loops build subsets by the thousand; :meth:`validate` checks the contents, and :meth:`from_arrays` and
+    :meth:`load` call it.
 
     :param depot: ``(batch, 2)``
     :param tasks: ``(batch, n_tasks, 2)``
-    :param values: ``(batch, n_tasks)``, the prize of each task
+    :param values: ``(batch, n_tasks)``, the value of each task
     :param max_distance: ``(batch,)``, the longest tour a UAV can fly (the paper's D), in the unit of the coordinates
     :param n_uavs: Number of UAVs (the paper's V), the same for all rows
     :param task_mask: ``(batch, n_tasks)`` bool, False where a row is padded
@@ -78,13 +87,13 @@ class Instances:
         :param max_distance: ``(batch,)`` or a number
         :param n_uavs: ``(batch,)``, all the same, or a number
         :param task_mask: ``(batch, n_tasks)`` bool; all True when None
-        :param source: What the arrays were read from, named in errors
+        :param source: Where the arrays come from, named in errors
         :return: The instances, float64 on the CPU
         :raises ValueError: If a shape or a value is not allowed; the message names the field and what was found
         """
-        tasks, depot = _as_numbers("tasks", tasks, source), _as_numbers("depot", depot, source)
-        values = None if values is None else _as_numbers("values", values, source)
-        task_mask = None if task_mask is None else _as_numbers("task_mask", task_mask, source)
+        tasks, depot = as_numbers("tasks", tasks, source), as_numbers("depot", depot, source)
+        values = None if values is None else as_numbers("values", values, source)
+        task_mask = None if task_mask is None else as_numbers("task_mask", task_mask, source)
         if tasks.ndim == 2 and depot.ndim == 1:
             tasks, depot = tasks[None], depot[None]
             values = None if values is None else values[None]
@@ -95,24 +104,27 @@ class Instances:
         if batch_size < 1 or n_tasks < 1:
             raise ValueError(f"{source}: field 'tasks' has shape {tasks.shape}; give at least one instance with one task.")
         if task_mask is not None and not np.isin(task_mask, (0, 1)).all():
-            raise ValueError(f"{source}: field 'task_mask' holds other things than True and False.")
-        uavs = np.unique(_per_instance("n_uavs", n_uavs, batch_size, source))
+            raise ValueError(f"{source}: field 'task_mask' holds values other than True and False.")
+        uavs = np.unique(per_instance("n_uavs", n_uavs, batch_size, source))
         if len(uavs) != 1:
             found = ", ".join(f"{n:g}" for n in uavs)
-            raise ValueError(f"{source}: field 'n_uavs' mixes {found}; store each fleet size in a file of its own.")
-        if not float(uavs[0]).is_integer() or uavs[0] < 1:
-            raise ValueError(f"{source}: field 'n_uavs' is {uavs[0]:g}, but a fleet has a whole number of UAVs, at least 1.")
-        distance = _per_instance("max_distance", max_distance, batch_size, source)
+            raise ValueError(f"{source}: field 'n_uavs' mixes {found}; store each fleet size in a separate file.")
+        if not float(uavs[0]).is_integer() or not 1 <= uavs[0] <= MAX_UAVS:
+            raise ValueError(
+                f"{source}: field 'n_uavs' is {uavs[0]:g}, but a fleet has a whole number of UAVs, at least 1, "
+                f"and {MAX_UAVS} at most."
+            )
+        distance = per_instance("max_distance", max_distance, batch_size, source)
         try:
             instances = cls(
                 depot=th.from_numpy(depot),
                 tasks=th.from_numpy(tasks),
-                values=th.ones(batch_size, n_tasks, dtype=th.float64) if values is None else th.from_numpy(values),
+                values=th.from_numpy(np.ones((batch_size, n_tasks)) if values is None else values),
                 max_distance=th.from_numpy(distance),
                 n_uavs=int(uavs[0]),
-                task_mask=th.ones(batch_size, n_tasks, dtype=th.bool)
-                if task_mask is None
-                else th.from_numpy(task_mask.astype(bool)),
+                task_mask=th.from_numpy(
+                    np.ones((batch_size, n_tasks), dtype=bool) if task_mask is None else task_mask.astype(bool)
+                ),
             )
             instances.validate()
         except ValueError as error:
@@ -123,9 +135,9 @@ class Instances:
         """
         Check the contents.
 
-        :raises ValueError: On NaN or infinite numbers, a negative value, values whose sum is infinite, ``max_distance <= 0``,
-            fewer than one UAV, padding that is not at the end of its row, or another dtype than float64; the message names
-            the field, the row and the value found
+        :raises ValueError: If a number is NaN or infinite, a value is negative, the sum of the values is infinite,
+            ``max_distance <= 0``, there is no UAV, padding is not at the end of its row, or a dtype is not float64; the
+            message names the field, the row and the value found
         """
         if self.task_mask.dtype != th.bool:
             raise ValueError(f"field 'task_mask' has dtype {self.task_mask.dtype}; it must be bool.")
@@ -139,8 +151,8 @@ class Instances:
                 where = tuple(int(i) for i in bad.nonzero()[0])
                 found = field[where].item()
                 raise ValueError(f"field '{name}' holds {found} at index {where}; every number must be finite in float32.")
-        if self.n_uavs < 1:
-            raise ValueError(f"field 'n_uavs' is {self.n_uavs}, but a fleet needs at least 1 UAV.")
+        if not 1 <= self.n_uavs <= MAX_UAVS:
+            raise ValueError(f"field 'n_uavs' is {self.n_uavs}, but a fleet needs at least 1 UAV, and {MAX_UAVS} at most.")
         too_short = self.max_distance.float() <= 0
         if too_short.any():
             row = int(too_short.nonzero()[0, 0])
@@ -173,22 +185,28 @@ class Instances:
     def device(self) -> th.device:
         return self.tasks.device
 
+    @property
+    def useful_fleet(self) -> int:
+        """Number of UAVs that can be of use, at most one per task; allocate memory for these only."""
+        return min(self.n_uavs, max(self.n_tasks, 1))
+
     def __len__(self) -> int:
         return self.batch_size
 
     def __getitem__(self, rows: int | np.integer | slice | th.Tensor | np.ndarray | Sequence[int]) -> Instances:
-        """Select rows; an ``int`` gives a batch of one, and one that is out of range an ``IndexError``."""
-        if isinstance(rows, int | np.integer):
-            if not -len(self) <= rows < len(self):
-                # This also ends iteration, which Python builds from __getitem__.
-                raise IndexError(f"instance {rows} of a batch of {len(self)}")
-            row = int(rows) % len(self)
-            rows = slice(row, row + 1)
-        index: Any = th.as_tensor(rows, device=self.device) if not isinstance(rows, slice | th.Tensor) else rows
+        """
+        Select rows.
+
+        :param rows: An integer (or 0-d array or tensor) for a batch of one; a slice; a sequence, array or tensor of row
+            numbers, possibly empty; or one bool per row
+        :return: The selected rows, a view where ``rows`` is an integer or a slice with a positive step
+        :raises IndexError: If there is no such row, or ``rows`` is none of these
+        """
+        index = row_index(rows, len(self), self.device)
         return self._map(lambda field: field[index])
 
     def to(self, device: th.device | str) -> Instances:
-        """Copy to ``device``; returns ``self`` when it is there already."""
+        """Copy to ``device``; returns ``self`` if it is already there."""
         if self.device == th.device(device):
             return self
         return self._map(lambda field: field.to(device))
@@ -200,7 +218,7 @@ class Instances:
 
     def replace_rows(self, rows: th.Tensor, others: Instances) -> Instances:
         """
-        Put other instances of the same size in the place of some rows.
+        Replace some rows by other instances of the same size.
 
         :param rows: ``(n,)`` int64, the rows to replace
         :param others: ``n`` instances
@@ -222,9 +240,10 @@ class Instances:
 
     def reorder(self, order: th.Tensor) -> Instances:
         """
-        Put the tasks into another order.
+        Reorder the tasks.
 
-        :param order: ``(batch, n_tasks)`` int64, which task comes first, second, ...; padded tasks stay at the end
+        :param order: ``(batch, n_tasks)`` int64, the index of the task in each place; padded tasks stay at the end
+        :return: The instances, tasks in the new order
         """
         return replace(
             self,
@@ -249,8 +268,11 @@ class Instances:
         """
         Join batches along the batch dimension, padding to the largest.
 
-        :raises ValueError: If the parts have different numbers of UAVs
+        :param parts: At least one batch; batches may be empty
+        :raises ValueError: If there are no parts, or if they have different numbers of UAVs
         """
+        if len(parts) == 0:
+            raise ValueError("There are no instances to join; give at least one batch.")
         fleets = {part.n_uavs for part in parts}
         if len(fleets) != 1:
             raise ValueError(f"Cannot join instances with different n_uavs: {sorted(fleets)}.")
@@ -261,16 +283,30 @@ class Instances:
 
     def digest(self, header: str | None = None) -> str:
         """
-        SHA-256 of the contents, by which equal instances are recognized.
+        SHA-256 of the contents. Equal instances have equal digests.
 
-        :param header: What is hashed before the tensors; number of UAVs, batch size and number of tasks when None
+        :param header: Text hashed before the tensors; number of UAVs, batch size and number of tasks when None
         :return: 64 hexadecimal digits
         """
         header = f"{self.n_uavs} {tuple(self.task_mask.shape)}\n" if header is None else header
         digest = hashlib.sha256(header.encode())
         for name in TENSOR_FIELDS:
-            digest.update(getattr(self, name).cpu().numpy().tobytes())
+            digest.update(getattr(self, name).detach().cpu().numpy().tobytes())
         return digest.hexdigest()
+
+    def near_origin(self) -> Instances:
+        """
+        Translate each row whose depot is far from the origin, relative to the maximum flight distance, so that its depot is at
+        the origin.
+
+        float32 resolves coordinates around 1e7 only to whole units. Call this before converting to float32, so that a
+        network's input does not depend on where the instance lies. Rows near the origin, such as the paper's, stay bit-equal.
+
+        :return: The translated instances
+        """
+        is_far = self.depot.abs().amax(1) > FAR_FROM_ORIGIN * self.max_distance
+        shift = self.depot.where(is_far[:, None], 0.0)
+        return replace(self, depot=self.depot - shift, tasks=self.tasks - shift[:, None])
 
     def home_distance(self) -> th.Tensor:
         """Distance of every task to its depot, ``(batch, n_tasks)`` float64."""
@@ -284,11 +320,15 @@ class Instances:
         """
         Write an ``.npz`` file (float64, no pickles) under a temporary name and rename it.
 
-        :param path: The file to write; ``.npz`` is appended when missing
+        :param path: The file to write; ``.npz`` is appended when missing, and missing folders are created
+        :raises ValueError: If the batch is empty
         """
+        if len(self) == 0:
+            raise ValueError(f"{path}: there are no instances to save; a file holds at least one.")
         path = Path(path)
         path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        arrays = {name: getattr(self, name).double().cpu().numpy() for name in ("depot", "tasks", "values", "max_distance")}
+        numbers = {name: getattr(self, name).detach().cpu() for name in TENSOR_FIELDS if name != "task_mask"}
+        arrays = {name: field.double().numpy() for name, field in numbers.items()}
         arrays["n_uavs"] = np.full(self.batch_size, self.n_uavs)
         if not self.task_mask.all():
             arrays["task_mask"] = self.task_mask.cpu().numpy()
@@ -304,33 +344,17 @@ class Instances:
         :param path: The file
         :return: The validated instances
         :raises FileNotFoundError: If there is no such file
-        :raises ValueError: If the file is not an intact ``.npz``, misses an array, or holds bad numbers
+        :raises ValueError: If the file is not an intact ``.npz``, lacks an array, holds an unknown array, or holds bad numbers
         """
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
         arrays = read_npz(path, "write it again")
+        known = (*TENSOR_FIELDS, "n_uavs")
+        unknown = [name for name in arrays if name not in known]
+        if unknown:
+            raise ValueError(f"{path}: unknown array '{unknown[0]}'; {advice_on(unknown[0], known)}.")
         missing = {"depot", "tasks", "max_distance", "n_uavs"} - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")
-        known = {"depot", "tasks", "values", "max_distance", "n_uavs", "task_mask"}
-        return cls.from_arrays(**{name: arrays[name] for name in known if name in arrays}, source=str(path))
-
-
-def _as_numbers(name: str, array: Any, source: str) -> np.ndarray:
-    """A float64 copy of anything that holds real numbers; the error names the field."""
-    try:
-        found = np.asarray(array)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: field '{name}' must be an array of real numbers: {error}") from error
-    if found.dtype.kind not in "biuf":
-        raise ValueError(f"{source}: field '{name}' must be an array of real numbers, found {array!r:.80}.")
-    return found.astype(np.float64)
-
-
-def _per_instance(name: str, array: Any, batch_size: int, source: str) -> np.ndarray:
-    """``(batch_size,)`` float64, from as many numbers or from one for all."""
-    numbers = _as_numbers(name, array, source)
-    if numbers.shape not in ((), (1,), (batch_size,)):
-        raise ValueError(f"{source}: field '{name}' has shape {numbers.shape}, expected ({batch_size},).")
-    return np.broadcast_to(numbers, (batch_size,)).copy()
+        return cls.from_arrays(**arrays, source=str(path))

@@ -1,8 +1,9 @@
-"""What a problem is: its spaces, its batched dynamics, and what it says of complete episodes."""
+"""The interface of a problem: instances, spaces, batched dynamics, and returns of complete episodes."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from enum import Enum
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -14,12 +15,20 @@ from sb3_uav.envs.instances import Instances
 
 StateT = TypeVar("StateT", bound="State")
 
-# What an observation keeps throughout an episode.
+# The keys of an observation that do not change during an episode.
 STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
 
 
+class Stage(Enum):
+    """How far an episode is, for drawings."""
+
+    ASSIGNING = "tasks are being assigned to UAVs; no UAV has taken off"
+    FLYING = "a UAV is under way"
+    FINISHED = "all UAVs are back at the depot"
+
+
 class State(Protocol):
-    """What every state holds: tensors with leading dimensions (batch, n_samples)."""
+    """The fields that every state has: tensors with leading dimensions (batch, n_samples)."""
 
     @property
     def done(self) -> th.Tensor:
@@ -28,7 +37,7 @@ class State(Protocol):
 
     @property
     def action_mask(self) -> th.Tensor:
-        """``(batch, n_samples, n_actions)`` bool, True where an action is legal; at least one is, always."""
+        """``(batch, n_samples, n_actions)`` bool, True where an action is legal; at least one always is."""
         ...
 
 
@@ -54,7 +63,7 @@ class Dynamics(ABC):
     @abstractmethod
     def step(self, state: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
         """
-        Finished episodes stay as they are, whatever their action.
+        Advance all episodes. Finished episodes do not change, whatever the action.
 
         :param state: The state, not modified
         :param actions: ``(batch, n_samples)`` int64
@@ -64,13 +73,15 @@ class Dynamics(ABC):
 
 class Problem(ABC):
     """
-    One level of the decomposition: where its instances come from, its spaces, its dynamics.
+    One level of the decomposition: its instances, spaces and dynamics.
 
     :param generator: Draws the instances
     """
 
     observation_space: spaces.Dict
     action_space: spaces.Discrete
+    # The stage of an episode before it ends.
+    running_stage: ClassVar[Stage]
     # Whether the number of UAVs of an instance matters.
     uses_fleet: ClassVar[bool] = True
 
@@ -146,7 +157,7 @@ class Problem(ABC):
 
         :param instances: ``batch`` instances
         :param actions: ``(batch, n_samples, n_steps)`` int64
-        :param returns: What :meth:`returns` says of them, ``(batch, n_samples)``
+        :param returns: ``(batch, n_samples)``, the result of :meth:`returns`
         :return: ``(batch, n_samples, n_steps)`` float64
         """
 
@@ -173,13 +184,19 @@ class Problem(ABC):
     def arrange(self, instances: Instances) -> Instances:
         """
         :param instances: Any instances
-        :return: They as episodes show them; tasks may stand in another order
+        :return: The instances as episodes present them, possibly with the tasks in another order
         """
         return instances
 
     @staticmethod
     def observe_static(instances: Instances) -> dict[str, th.Tensor]:
-        """The part of the observation that an episode keeps, float32 with leading dimension ``batch``."""
+        """
+        The part of the observation that does not change during an episode.
+
+        :param instances: ``batch`` instances
+        :return: Tensors with leading dimension ``batch``, float32; coordinates are those of :meth:`Instances.near_origin`
+        """
+        instances = instances.near_origin()
         return {
             "depot": instances.depot.float(),
             "tasks": instances.tasks.float().flatten(1),

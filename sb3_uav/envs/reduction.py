@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,8 +19,11 @@ MARGIN = 1e-3
 USABLE_TOLERANCE = (1.0 - MARGIN) * DISTANCE_TOLERANCE
 # Rounding of values that are multiples of one another, as a part of them.
 MULTIPLE_TOLERANCE = 1e-12
-# The maximum flight distance in integers. Even, so that rounding up never forbids a flight to a reachable task.
+# The maximum flight distance in integers, for costs.
 RESOLUTION = 2_000_000
+# The same for limits: so fine that rounding up every leg of a tour, of up to 17,000, stays within the usable tolerance. Even,
+# so that it never forbids a flight to a reachable task either.
+FINE_RESOLUTION = 2**45
 
 
 @dataclass(frozen=True)
@@ -80,13 +85,30 @@ class ReducedInstance:
         routes = [[node_of[task] for task in route if task in node_of] for route in schedule.routes]
         return [route for route in routes if route]
 
-    def integer_distances(self) -> np.ndarray:
+    def coarse_distances(self) -> np.ndarray:
         """
-        Rounded up, so that a tour that is feasible with them is feasible.
+        Rounded down: every feasible tour is at most :data:`RESOLUTION` long, but a tour of this length may be infeasible by
+        one unit per leg.
 
-        :return: ``(n + 1, n + 1)`` int64; the longest feasible tour is :data:`RESOLUTION`
+        :return: ``(n + 1, n + 1)`` int64
         """
-        return np.ceil(self.distances * RESOLUTION).astype(np.int64)
+        return np.floor(self.distances * RESOLUTION).astype(np.int64)
+
+    def fine_distances(self) -> np.ndarray:
+        """
+        Rounded up: a tour of at most :data:`FINE_RESOLUTION` is feasible, and so long is every tour that keeps to the maximum
+        flight distance without any tolerance.
+
+        :return: ``(n + 1, n + 1)`` int64
+        """
+        return np.ceil(self.distances * FINE_RESOLUTION).astype(np.int64)
+
+    def tour_length(self, route: Iterable[int]) -> float:
+        """
+        :param route: Nodes in flying order, without the depot
+        :return: Length of the closed tour, which is feasible if that is at most 1
+        """
+        return math.fsum(self.distances[a, b] for a, b in pairwise((0, *route, 0)))
 
     def integer_prizes(self, finest: int, largest_sum: int) -> np.ndarray:
         """

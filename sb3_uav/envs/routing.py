@@ -13,7 +13,7 @@ from sb3_uav.envs.distances import distance_limit, euclidean
 from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Dynamics, Problem
+from sb3_uav.envs.problem import Dynamics, Problem, Stage
 
 DEPOT = 0
 
@@ -42,9 +42,9 @@ class RoutingDynamics(Dynamics):
     """
     Transitions of route planning (paper, section IV-B).
 
-    A task is legal while it is unvisited and the UAV could fly to it and from there home: travelled + d(here, task) +
-    d(task, depot) <= D. The depot is legal only when no task is, because an early return can never help. An illegal action
-    flies the UAV home and so ends the episode.
+    A task is legal if it is unvisited and the UAV can fly to it and back to the depot: travelled + d(here, task) +
+    d(task, depot) <= D. The depot is legal only when no task is, because an early return never helps. An illegal action
+    sends the UAV to the depot and ends the episode.
 
     :param instances: The instances; each row is one UAV's tasks, ``n_uavs`` is not used
     """
@@ -83,9 +83,9 @@ class RoutingDynamics(Dynamics):
         node = th.where(legal, actions, DEPOT)
         goes_home = (node == DEPOT) & ~state.done
         here, there = self.points(state.position), self.points(node)
-        # A finished UAV stands in the depot and goes nowhere: its leg has length 0.
+        # A finished UAV stays at the depot: its leg has length 0.
         travelled = state.travelled + euclidean(there, here)
-        # A padded first column takes the visits of the depot.
+        # The extra first column absorbs visits to the depot.
         visited = th.cat([th.zeros_like(state.visited[..., :1]), state.visited], dim=-1)
         visited = visited.scatter(-1, node[..., None], True)[..., 1:]
         done = state.done | goes_home
@@ -96,7 +96,7 @@ class RoutingDynamics(Dynamics):
 
 def nearest_feasible(instances: Instances) -> th.Tensor:
     """
-    Always fly to the nearest task that still fits: the router of an allocation env that was given none.
+    Always fly to the nearest task that is still feasible; the default router of allocation environments.
 
     :param instances: ``batch`` instances, one tour each
     :return: ``(batch, n_steps)`` int64 node indices, padded with the depot
@@ -110,7 +110,7 @@ def nearest_feasible(instances: Instances) -> th.Tensor:
         action = distance.masked_fill(~state.action_mask, th.inf).argmin(-1)
         tours.append(action)
         state, _ = dynamics.step(state, action)
-    return th.cat(tours, dim=1)
+    return th.cat(tours, dim=1) if tours else state.position
 
 
 def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
@@ -128,6 +128,7 @@ def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
 class RoutingProblem(Problem):
     """Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited."""
 
+    running_stage = Stage.FLYING
     uses_fleet = False
 
     def _action_space(self) -> spaces.Discrete:

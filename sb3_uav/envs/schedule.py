@@ -1,4 +1,4 @@
-"""Schedules, and the one independent check that every solver's schedules must pass."""
+"""Schedules, and the independent checker that every solver's schedules must pass."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sb3_uav.envs.instances import Instances
 
 
 class InfeasibleScheduleError(ValueError):
-    """A schedule breaks a constraint of its instance."""
+    """A schedule violates a constraint of its instance."""
 
 
 @dataclass(frozen=True, init=False)
 class Schedule:
     """
-    One route per UAV; every route starts and ends in the depot, which is not listed.
+    One route per UAV. Every route starts and ends at the depot, which is not listed.
 
     :param routes: Task indices from 0, in flying order
     """
@@ -37,7 +37,7 @@ class Schedule:
 @dataclass(frozen=True)
 class ScheduleReport:
     """
-    What a checked schedule achieves.
+    Result of checking a feasible schedule.
 
     :param objective: Total value of the visited tasks
     :param lengths: Length of every UAV's closed tour, in the unit of the coordinates
@@ -55,14 +55,17 @@ def check_schedule(instances: Instances, row: int, schedule: Schedule) -> Schedu
     """
     Check a schedule against its instance (paper, equations (1) to (6)), in plain Python floats.
 
-    Written without any of the dynamics' code, so that a fault there cannot hide here.
+    It shares no code with the dynamics, so that an error there is found here.
 
     :param instances: The instances
-    :param row: Which of them
-    :param schedule: The schedule
-    :return: Objective and tour lengths
-    :raises InfeasibleScheduleError: If a constraint is broken; the message says which, where and by how much
+    :param row: Index of the instance
+    :param schedule: The schedule; UAVs without a route stay at the depot
+    :return: Objective and the lengths of the given routes
+    :raises InfeasibleScheduleError: If a constraint is violated; the message says which, where and by how much
+    :raises IndexError: If there is no such row
     """
+    if not -len(instances) <= row < len(instances):
+        raise IndexError(f"instance {row} of a batch of {len(instances)}")
     depot = [float(x) for x in instances.depot[row].tolist()]
     tasks = instances.tasks[row].tolist()
     values = instances.values[row].tolist()
@@ -96,8 +99,8 @@ def schedule_to_json(solver: str, row: int, schedule: Schedule, report: Schedule
     :param solver: Name of the solver
     :param row: Index of the instance
     :param schedule: The schedule
-    :param report: What :func:`check_schedule` said of it
-    :return: One line of a ``schedules.jsonl``
+    :param report: The result of :func:`check_schedule`
+    :return: The fields of one line of a ``schedules.jsonl``
     """
     return {
         "solver": solver,

@@ -1,4 +1,4 @@
-"""The order in which a sweep around the depot meets the tasks."""
+"""The order of the tasks in a sweep around the depot."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def sweep_order(instances: Instances, gap: int = 0, clockwise: bool = False) -> 
     Sort tasks by their polar angle around the depot, starting after a wide gap between two of them.
 
     :param instances: ``batch`` instances
-    :param gap: After which gap to start: 0 for the widest, 1 for the second widest, ...
-    :param clockwise: Whether to turn the other way round
-    :return: ``(batch, n_tasks)`` int64, which task comes first, second, ...; padded tasks keep their places at the end
+    :param gap: Rank of the gap to start after: 0 for the widest, 1 for the second widest, ...
+    :param clockwise: Whether to sweep clockwise
+    :return: ``(batch, n_tasks)`` int64, the index of the task in each place; padded tasks keep their places at the end
     """
     offset = instances.tasks - instances.depot[:, None]
     angle = th.atan2(offset[..., 1], offset[..., 0])

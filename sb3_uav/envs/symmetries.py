@@ -1,4 +1,4 @@
-"""Instances turned and mirrored around their depots."""
+"""Rotations and reflections of instances around their depots."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ N_SYMMETRIES = 8
 
 def reflect(instances: Instances, symmetry: int) -> Instances:
     """
-    Turn and mirror the tasks around the depot; all distances stay as they are.
+    Rotate and reflect the tasks around the depot, which preserves all distances.
 
     :param instances: ``batch`` instances
-    :param symmetry: Which of the :data:`N_SYMMETRIES` symmetries of the square; 0 changes nothing
-    :return: The instances seen in that way
+    :param symmetry: Index of one of the :data:`N_SYMMETRIES` symmetries of the square; 0 is the identity
+    :return: The transformed instances
     """
     if symmetry == 0:
         return instances
@@ -30,11 +30,11 @@ def reflect(instances: Instances, symmetry: int) -> Instances:
 
 def turn(instances: Instances, angle: th.Tensor) -> Instances:
     """
-    Turn the tasks around the depot; all distances stay as they are, but for rounding errors.
+    Rotate the tasks around the depot, which preserves all distances up to rounding errors.
 
     :param instances: ``batch`` instances
     :param angle: ``(batch,)``, in radians
-    :return: The turned instances
+    :return: The rotated instances
     """
     x, y = (instances.tasks - instances.depot[:, None]).unbind(-1)
     cosine, sine = (part.to(x.dtype)[:, None] for part in (angle.cos(), angle.sin()))

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
@@ -17,21 +17,52 @@ from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.problem import Problem
 
-# Wrappers that change nothing: episode statistics are kept below.
-TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker)
+# Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
+TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
+
+
+def strip_wrappers(env: gym.Env) -> gym.Env:
+    """
+    :param env: An environment
+    :return: What is left without the wrappers around it that change nothing, among them a time limit that no episode reaches
+    """
+    inner: Any = env
+    # Only exact types: a subclass may behave differently.
+    while type(inner) in TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
+        inner = inner.env
+    return inner
+
+
+def find_monitor(env: gym.Env) -> Monitor | None:
+    """
+    :param env: An environment
+    :return: The outermost ``Monitor`` around it
+    """
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, Monitor):
+            return inner
+        inner = inner.env
+    return None
+
+
+def _can_cut_off(limit: TimeLimit) -> bool:
+    """Whether an episode inside may be longer than the limit; True if there is no telling."""
+    n_steps = None if limit.spec is None else limit.spec.max_episode_steps
+    inner = limit.unwrapped
+    # The router's tours visit every task and the depot at most; the allocator takes one step fewer.
+    return n_steps is None or not isinstance(inner, ProblemEnv) or n_steps < inner.problem.generator.n_tasks + 1
 
 
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
     """
     :param env: An environment
-    :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper around it changes what it does
+    :return: The :class:`ProblemEnv` inside, or None if there is none or a wrapper changes its behavior
     """
-    inner: Any = env
-    # Exact types and ProblemEnv's own methods only: a subclass may do something else.
-    while type(inner) in TRANSPARENT_WRAPPERS:
-        inner = inner.env
+    inner = strip_wrappers(env)
     if not isinstance(inner, ProblemEnv):
         return None
+    # Only ProblemEnv's own methods: a subclass may behave differently.
     inherits = type(inner).step is ProblemEnv.step and type(inner).reset is ProblemEnv.reset
     return inner if inherits else None
 
@@ -40,12 +71,12 @@ class BatchedVecEnv(VecEnv):
     """
     A drop-in for ``DummyVecEnv`` that steps all its episodes with one batched tensor operation.
 
-    Seeded alike, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it says
-    what the problem is, and its ``Monitor``, if it has a file, logs the episodes of row 0. Every episode's statistics are in
-    ``infos[i]["episode"]``, as with ``Monitor``.
+    With the same seed, it plays exactly the episodes of a ``DummyVecEnv``. Only the first of the ``env_fns`` is called: it
+    defines the problem, and its ``Monitor``, if it has a file, logs the episodes of all rows, as ``VecMonitor`` does. The
+    statistics of an episode are in ``infos[i]["episode"]``, as with ``Monitor``.
 
     :param env_fns: Functions that make the environment, as for ``DummyVecEnv``; one per row
-    :raises ValueError: If the functions do not make one of our environments, or wrap it in something that changes it
+    :raises ValueError: If the functions do not make an environment of this package, or wrap it in something that changes it
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
@@ -55,7 +86,7 @@ class BatchedVecEnv(VecEnv):
             raise ValueError(f"BatchedVecEnv cannot batch {env}; use stable_baselines3's DummyVecEnv for it.")
         self.template = problem_env
         self.problem: Problem = problem_env.problem
-        self._monitor = env if isinstance(env, Monitor) else None
+        self._monitor = find_monitor(env)
         self._info_keywords: tuple[str, ...] = () if self._monitor is None else self._monitor.info_keywords
         self._windows: dict[int, Any] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
@@ -101,8 +132,7 @@ class BatchedVecEnv(VecEnv):
                 infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
                 for key in self._info_keywords:
                     infos[row]["episode"][key] = infos[row][key]
-            if 0 in finished:
-                self.log_episode(infos[0]["episode"])
+                self.log_episode(infos[row]["episode"])
             for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
                 counter[finished] = 0
             self.episodes.reset(finished)
@@ -115,16 +145,27 @@ class BatchedVecEnv(VecEnv):
         return {"r": round(float(episode_return), 6), "l": int(length), "t": elapsed}
 
     def log_episode(self, episode_info: dict[str, float]) -> None:
-        """Write a row to the monitor file, if there is one."""
+        """
+        Write a line to the monitor file, if there is one.
+
+        All rows write to the same file, so that SB3's ``load_results`` and ``plot_results`` count all time steps.
+
+        :param episode_info: The result of :meth:`episode_info`, and the info keywords of the ``Monitor``
+        """
         if self._monitor is not None and self._monitor.results_writer is not None:
             self._monitor.results_writer.write_row(episode_info)
 
     @property
     def monitor_folder(self) -> str | None:
-        """Where the monitor file lies, if there is one."""
+        """Folder of the monitor file, if there is one."""
         if self._monitor is None or self._monitor.results_writer is None:
             return None
         return os.path.dirname(self._monitor.results_writer.file_handler.name)
+
+    @property
+    def info_keywords(self) -> tuple[str, ...]:
+        """What the monitor file holds of an episode besides its return, length and time."""
+        return self._info_keywords
 
     def action_masks(self) -> np.ndarray:
         """``(n_envs, n_actions)`` bool, True where an action is legal."""
@@ -153,7 +194,7 @@ class BatchedVecEnv(VecEnv):
         figure = MapFigure()
         images = []
         for row in rows:
-            figure.draw(self.episodes.instances, row, self.episodes.routes(row))
+            figure.draw(self.episodes, row)
             images.append(figure.rgb_array())
         return images
 
@@ -163,11 +204,11 @@ class BatchedVecEnv(VecEnv):
         for row in rows:
             if row not in self._windows:
                 self._windows[row] = MapFigure(interactive=True)
-            self._windows[row].draw(self.episodes.instances, row, self.episodes.routes(row))
+            self._windows[row].draw(self.episodes, row)
             self._windows[row].show()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the one shared environment, once per row; ``instance`` differs from row to row."""
+        """The attribute of the shared environment, once per row; ``instance`` differs between rows."""
         rows = self._get_indices(indices)
         if attr_name == "instance":
             return [self.episodes.instances[row] for row in rows]
@@ -175,9 +216,9 @@ class BatchedVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
-        Set an attribute of the one shared environment.
+        Set an attribute of the shared environment.
 
-        :raises ValueError: If only some rows are named, because all rows share it
+        :raises ValueError: If only some rows are given, because all rows share the environment
         """
         self._require_all_rows(indices, f"set {attr_name}")
         setattr(self.template, attr_name, value)
@@ -186,9 +227,9 @@ class BatchedVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        Call a method of every row's environment; ``action_masks`` and ``render`` answer row by row.
+        Call a method of every row's environment; ``action_masks`` and ``render`` return results for each row.
 
-        :raises ValueError: If only some rows are named for a method that they share
+        :raises ValueError: If only some rows are given for a method of the shared environment
         """
         rows = list(self._get_indices(indices))
         if method_name == "action_masks":
@@ -206,7 +247,7 @@ class BatchedVecEnv(VecEnv):
         return [result for _ in rows]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """True for ``Monitor``, whose statistics this class provides; other wrappers are refused in the constructor."""
+        """True for ``Monitor``, whose statistics this class provides; the constructor refuses other wrappers."""
         return [issubclass(Monitor, wrapper_class) for _ in self._get_indices(indices)]
 
     def _require_all_rows(self, indices: VecEnvIndices, action: str) -> None:

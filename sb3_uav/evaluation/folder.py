@@ -48,9 +48,9 @@ class EvaluationFolder:
     :param folder: The folder; it exists
     :param sources: The sets of instances, on the CPU
     :param solvers: The solvers that are going to run
-    :param run: What ``evaluation.json`` shall say of this run
-    :param resume: Whether to go on with what is there, instead of starting anew
-    :raises ValueError: If there are results to go on with, but of other instances, of other solvers with the same names, or of
+    :param run: Description of this run for ``evaluation.json``
+    :param resume: Whether to keep the results that are present, instead of starting over
+    :raises ValueError: If there are results to resume, but of other instances, of other solvers with the same names, or of
         another format; or if the folder cannot be written
     :ivar rows: The results that are present
     :ivar changed_versions: Packages that have changed since the run before, with their versions
@@ -83,7 +83,7 @@ class EvaluationFolder:
         self._solver_order = {name: position for position, name in enumerate(settings["solvers"])}
         if resume:
             self._read({solver.name for solver in solvers if not solver.uses_time_limit})
-        # In this order, so that old results never stand beside the settings of new ones.
+        # In this order, so that old results never stand beside new settings.
         self._write_in_order()
         with replaced_when_complete(folder / SETTINGS_FILE) as file:
             json.dump(settings, file, indent=2, allow_nan=False)
@@ -117,7 +117,7 @@ class EvaluationFolder:
         self.rows[row.key] = row
 
     def _write_in_order(self) -> None:
-        """Write both files anew: set by set, and in a set the solvers in the order in which they first came."""
+        """Rewrite both files: set by set, and within a set in the order in which the solvers first appeared."""
 
         def position(row: ResultRow) -> tuple[float, ...]:
             limit = -math.inf if row.time_limit is None else row.time_limit
@@ -131,39 +131,51 @@ class EvaluationFolder:
 
     def _merged(self, settings: dict[str, Any]) -> dict[str, Any]:
         """
-        :param settings: Of the present evaluation
-        :return: Also those of the earlier ones of this folder
+        :param settings: Settings of the present evaluation
+        :return: The settings of both, the present and earlier evaluations of this folder
         :raises ValueError: If they do not belong into the same folder
         """
         path = self.folder / SETTINGS_FILE
-        anew = "choose another folder, or start anew with --overwrite"
+        remedy = "choose another folder, or start over with --overwrite"
         try:
             earlier = json.loads(path.read_text(encoding="utf-8"))
             if earlier["format"] != FORMAT:
                 raise ValueError(f"its format is {earlier['format']!r}, expected {FORMAT}")
             sources = [{key: source[key] for key in ("name", "n_instances", "sha256")} for source in earlier["instances"]]
-            solvers = {name: dict(solver["settings"]) for name, solver in earlier["solvers"].items()}
+            # None for solvers that could not be made.
+            solvers = {
+                name: None if solver["settings"] is None else dict(solver["settings"])
+                for name, solver in earlier["solvers"].items()
+            }
             versions = dict(earlier["runs"][-1]["versions"])
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"{path}: does not tell what the {RESULTS_FILE} beside it holds ({one_line(error)}); {anew}."
+                f"{path}: does not describe the {RESULTS_FILE} beside it ({one_line(error)}); {remedy}."
             ) from error
         # Instances are numbered through all sets, so that one list must be the beginning of the other.
         for before, now in zip(sources, settings["instances"], strict=False):
             if before != now:
-                told = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
+                pair = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
                 raise ValueError(
-                    f"{self.folder}: holds results of other instances, {told[0]} where now comes {told[1]}; give the same "
-                    f"files in the same order, {anew}."
+                    f"{self.folder}: holds results of other instances: {pair[0]}, not {pair[1]}; give the same "
+                    f"files in the same order, {remedy}."
                 )
         for name, solver in settings["solvers"].items():
-            was, is_now = solvers.get(name, solver["settings"]), solver["settings"]
+            was, is_now = solvers.get(name), solver["settings"]
+            if was is None or is_now is None:
+                continue
             for key in sorted({*was, *is_now}):
                 if was.get(key) != is_now.get(key):
                     raise ValueError(
                         f"{self.folder}: holds results of another {name!r}, whose {key} was {_abridged(was.get(key))} and not "
-                        f"{_abridged(is_now.get(key))}; give it another name, {anew}."
+                        f"{_abridged(is_now.get(key))}; give it another name, {remedy}."
                     )
+        # A solver that cannot be made now keeps its earlier description.
+        described = {
+            name: solver
+            for name, solver in settings["solvers"].items()
+            if solver["settings"] is not None or name not in earlier["solvers"]
+        }
         installed = settings["runs"][0]["versions"]
         self.changed_versions = [
             f"{package} {versions.get(package, 'none')} -> {installed.get(package, 'none')}"
@@ -173,16 +185,16 @@ class EvaluationFolder:
         return {
             "format": FORMAT,
             "instances": max(sources, settings["instances"], key=len),
-            "solvers": {**earlier["solvers"], **settings["solvers"]},
+            "solvers": {**earlier["solvers"], **described},
             "runs": [*earlier["runs"], *settings["runs"]],
         }
 
     def _read(self, without_limit: Collection[str]) -> None:
         """
-        Read what is there; results without their schedule are left out.
+        Read the results that are present; those without their schedule are left out.
 
-        :param without_limit: Names of solvers that use no time limit. Their failures at one are of a time when nobody could
-            know that, and are left out: nothing would ever take their place
+        :param without_limit: Names of solvers that use no time limit. Their failures at a time limit date from runs in which
+            that was unknown; they are left out, because no later result would replace them
         :raises ValueError: If a file is damaged, or of another format
         """
         self._schedules = read_schedules(self.folder / SCHEDULES_FILE)
@@ -190,7 +202,7 @@ class EvaluationFolder:
             if row.source not in self._source_order or row.solver not in self._solver_order:
                 raise ValueError(
                     f"{self.folder / RESULTS_FILE}: holds results of {row.solver!r} on {row.source!r}, of which "
-                    f"{SETTINGS_FILE} knows nothing; choose another folder, or start anew with --overwrite."
+                    f"{SETTINGS_FILE} holds no description; choose another folder, or start over with --overwrite."
                 )
             if row.status == FAILED and row.time_limit is not None and row.solver in without_limit:
                 continue

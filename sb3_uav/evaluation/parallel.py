@@ -1,4 +1,4 @@
-"""Running a solver on instances, in this process or in others, so that one that fails harms nothing else."""
+"""Running a solver on instances, in this process or in others, with failures kept apart."""
 
 from __future__ import annotations
 
@@ -19,39 +19,44 @@ import torch as th
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.results import one_line
-from sb3_uav.solvers.base import OneByOneSolver, Solver, SolverResult
+from sb3_uav.solvers.base import NoScheduleError, OneByOneSolver, Solver, SolverResult
 
-# One that it solves, and one to go on with while the main process writes down the result.
+# One being solved, and the next one, so that no process waits for the main process.
 TASKS_PER_PROCESS = 2
 
 
 class Failure(NamedTuple):
     """
-    :param message: What went wrong, in one line
+    :param message: The reason, in one line
+    :param bound: A proven upper bound of the objective, if the solver has one
     """
 
     message: str
+    bound: float | None = None
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
         """
-        :param error: What a solver raised
+        :param error: An exception of a solver
+        :return: The failure
         """
         text = one_line(error)
-        # Ours are whole sentences; of others the type is often the best part.
-        return cls(text if text and isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {text}")
+        # Our messages are whole sentences; in others, the type often says most.
+        is_ours = isinstance(error, ValueError | ImportError | NoScheduleError)
+        bound = error.bound if isinstance(error, NoScheduleError) else None
+        return cls(text if text and is_ours else f"{type(error).__name__}: {text}", bound)
 
 
 class Task(NamedTuple):
     """
-    One instance for a worker. As numpy arrays, because torch would pass tensors on through shared memory.
+    One instance for a worker, as NumPy arrays, because torch passes tensors through shared memory.
 
     :param solver: The solver
     :param n_uavs: Number of UAVs
     :param arrays: The other fields of :class:`Instances`, a batch of one
     :param row: Index of the instance in its set
     :param time_limit: Seconds
-    :param seed: Of the solver
+    :param seed: Seed of the solver
     """
 
     solver: OneByOneSolver
@@ -81,26 +86,26 @@ def solve_row(
     :param instance: A batch of one
     :param row: Its index in its set
     :param time_limit: Seconds
-    :param seed: Of the solver
-    :return: What the solver found, or why it did not
+    :param seed: Seed of the solver
+    :return: The result, or the failure
     """
     try:
         return solver.solve_row(instance, row, time_limit, seed)
     except Exception as error:
-        # Solvers call packages that raise what they like; the evaluation of others must go on.
+        # Solvers call packages that raise exceptions of any kind; the other evaluations must continue.
         return Failure.of(error)
 
 
 def _start_worker() -> None:
-    """What a worker does first."""
+    """Initialize a worker."""
     th.set_num_threads(1)
-    # Ctrl-C reaches all processes of a terminal; the main one ends the others.
+    # Ctrl-C reaches all processes of a terminal; the main process ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Without this, workers of a main process that was killed would solve on, or wait for ever."""
+    """End this worker with the main process. Otherwise, if that is killed, workers run on or wait forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -109,9 +114,9 @@ def _end_with_parent() -> None:
 
 class _RecordingContext(SpawnContext):
     """
-    Starts processes for an executor and keeps them, because an executor offers no way to end its own before Python 3.14.
+    Starts the processes of an executor and records them, because executors cannot end their processes before Python 3.14.
 
-    :ivar processes: All that were started
+    :ivar processes: All processes started so far
     """
 
     def __init__(self) -> None:
@@ -127,7 +132,7 @@ class _RecordingContext(SpawnContext):
         started = [process for process in self.processes if process.pid is not None]
         for process in started:
             process.kill()
-        # Not by joining them: the executor's own thread does that, and only one of the two would see the exit code.
+        # Not by joining them: the executor's thread does that, and only one of the two threads would see the exit code.
         alive = {process.sentinel for process in started}
         while alive:
             alive.difference_update(wait_for_handles(alive))
@@ -135,7 +140,7 @@ class _RecordingContext(SpawnContext):
 
 class Runner:
     """
-    Runs solvers, :class:`OneByOneSolver` in parallel processes if there shall be more than one. Use it as a context manager.
+    Runs solvers; instances of :class:`OneByOneSolver` in parallel processes if there is more than one. A context manager.
 
     :param n_jobs: Number of processes
     :raises ValueError: If it is less than 1
@@ -147,6 +152,11 @@ class Runner:
         self.n_jobs = n_jobs
         self._pool: ProcessPoolExecutor | None = None
         self._context = _RecordingContext()
+
+    @property
+    def processes(self) -> list[SpawnProcess]:
+        """The processes of the pool that is in use."""
+        return [] if self._pool is None else self._context.processes
 
     def __enter__(self) -> Runner:
         return self
@@ -162,7 +172,7 @@ class Runner:
         :param instances: ``batch`` instances on the CPU
         :param rows: Indices of those to solve
         :param time_limit: Seconds per instance
-        :param seed: Of the solver
+        :param seed: Seed of the solver
         :return: Index and result of each, as they become known; in any order with several processes
         """
         if not isinstance(solver, OneByOneSolver):
@@ -191,7 +201,7 @@ class Runner:
         suspected: set[int] = set()
         running: dict[Future[SolverResult | Failure], Task] = {}
         while waiting or suspects or running:
-            # When a process has died, each of the instances that may have been the reason runs alone.
+            # After a process has died, each instance that may have been the cause runs alone.
             queue, room = (suspects, 1) if suspects else (waiting, self.n_jobs * TASKS_PER_PROCESS)
             while queue and len(running) < room:
                 task = queue.popleft()
@@ -209,7 +219,7 @@ class Runner:
                         suspected.add(task.row)
                         suspects.append(task)
                 except Exception as error:
-                    # What cannot be sent to another process.
+                    # A solver or result that cannot be pickled.
                     yield task.row, Failure.of(error)
 
     def _submit(self, task: Task) -> Future[SolverResult | Failure]:

@@ -12,23 +12,23 @@ import sb3_uav
 from sb3_uav.common.files import file_hash
 from sb3_uav.solvers.base import Solver
 
-# Packages whose version may change what a solver finds.
+# Packages whose version may change the schedules of a solver.
 PACKAGES = ("torch", "numpy", "stable-baselines3", "scipy", "numba", "ortools", "pyvrp", "highspy", "gurobipy")
 
 
 def describe_solver(solver: Solver) -> dict[str, Any]:
     """
     :param solver: A solver
-    :return: What ``evaluation.json`` says of it
+    :return: Its entry in ``evaluation.json``
     """
     files = {purpose: {"path": str(path), "sha256": file_hash(path)} for purpose, path in solver.files.items()}
-    # As it comes back from the file, where there are no tuples.
+    # As it is read back from the file, without tuples.
     return json.loads(json.dumps({"spec": solver.spec, "settings": solver.settings(), "files": files}))
 
 
 def describe_machine() -> dict[str, Any]:
     """
-    :return: Versions of what takes part in an evaluation, and on what it runs
+    :return: Versions of all packages that take part in an evaluation, and the machine
     """
     versions = {"sb3-uav": sb3_uav.__version__, "python": platform.python_version()}
     for package in PACKAGES:

@@ -17,7 +17,7 @@ OK, INFEASIBLE, FAILED = "ok", "infeasible", "failed"
 
 class ResultKey(NamedTuple):
     """
-    What a result belongs to.
+    Identifies a result.
 
     :param solver: Name of the solver
     :param instance: Index of the instance, counted through all sets
@@ -34,7 +34,7 @@ class ResultKey(NamedTuple):
 @dataclass(frozen=True)
 class ResultRow:
     """
-    One line of ``results.csv``. What is not known is None, and an empty cell.
+    One line of ``results.csv``. Unknown values are None, and empty cells in the file.
 
     :param solver: Name of the solver
     :param instance: Index of the instance, counted through all sets
@@ -48,7 +48,7 @@ class ResultRow:
     :param time_limit: Seconds that the solver was given
     :param seed: Seed of the solver
     :param batch_size: How many instances were solved at once
-    :param bound: A proven upper bound of the objective
+    :param bound: A proven upper bound of the objective; possibly also of a solver that found no schedule
     :param status: ``ok``; ``infeasible`` if the checker refused the schedule; ``failed`` if the solver returned none
     :param message: What the checker or the solver said, in one line
     """
@@ -83,7 +83,7 @@ OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound
 def one_line(text: object) -> str:
     """
     :param text: Anything that can be printed
-    :return: It, without line breaks
+    :return: The text without line breaks
     """
     return " ".join(str(text).split())
 
@@ -98,7 +98,7 @@ def read_results(path: Path) -> list[ResultRow]:
     if header != ",".join(RESULT_COLUMNS):
         raise ValueError(
             f"{path}: its columns are not those that this version writes ({header!r:.120}); "
-            "choose another folder, or start anew with --overwrite."
+            "choose another folder, or start over with --overwrite."
         )
     rows = []
     for number, line in enumerate(lines, start=2):
@@ -106,7 +106,7 @@ def read_results(path: Path) -> list[ResultRow]:
             rows.append(_parse_row(next(csv.reader([line], strict=True))))
         except (ValueError, csv.Error, StopIteration) as error:
             raise ValueError(
-                f"{path}, line {number}: is damaged ({error}); mend or delete that line, or start anew with --overwrite."
+                f"{path}, line {number}: is damaged ({error}); correct or delete that line, or start over with --overwrite."
             ) from error
     return rows
 
@@ -114,22 +114,22 @@ def read_results(path: Path) -> list[ResultRow]:
 def _whole_lines(path: Path) -> list[str]:
     """
     :param path: A text file that was written line by line
-    :return: Its lines, but for a last one without a line break
-    :raises ValueError: If it is no text
+    :return: Its lines, except for a last one without a line break
+    :raises ValueError: If it is not a text file
     """
     try:
         text, end, _ = path.read_bytes().rpartition(b"\n")
-        # Not splitlines, which also splits at characters that a name may hold.
+        # Not by splitlines, which also splits at characters that may be part of a name.
         return text.decode("utf-8").split("\n") if end else []
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is damaged ({error}); start anew with --overwrite.") from error
+        raise ValueError(f"{path}: is damaged ({error}); start over with --overwrite.") from error
 
 
 def _parse_row(cells: Sequence[str]) -> ResultRow:
     """
     :param cells: One line of ``results.csv``
     :return: The row
-    :raises ValueError: If a cell cannot be what it is said to be
+    :raises ValueError: If a cell has a wrong value
     """
     if len(cells) != len(RESULT_COLUMNS):
         raise ValueError(f"{len(cells)} cells instead of {len(RESULT_COLUMNS)}")
@@ -148,7 +148,7 @@ def _parse_row(cells: Sequence[str]) -> ResultRow:
 def read_schedules(path: Path) -> dict[ResultKey, str]:
     """
     :param path: A ``schedules.jsonl``, which may be missing
-    :return: Its lines, by what they belong to
+    :return: Its lines by result
     :raises ValueError: If it was damaged
     """
     lines = _whole_lines(path) if path.is_file() else []
@@ -160,6 +160,6 @@ def read_schedules(path: Path) -> dict[ResultKey, str]:
             schedules[key] = line
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{path}, line {number}: is damaged ({error!r}); mend or delete that line, or start anew with --overwrite."
+                f"{path}, line {number}: is damaged ({error!r}); correct or delete that line, or start over with --overwrite."
             ) from error
     return schedules

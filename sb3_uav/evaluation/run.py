@@ -14,7 +14,7 @@ from sb3_uav.evaluation.folder import EvaluationFolder
 from sb3_uav.evaluation.locking import locked_folder
 from sb3_uav.evaluation.parallel import Failure, Runner
 from sb3_uav.evaluation.set_evaluation import Progress, SetEvaluation
-from sb3_uav.evaluation.summary import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarise, write_summary
+from sb3_uav.evaluation.summary import SUMMARY_CSV, SUMMARY_JSON, SummaryRow, summarize, write_summary
 from sb3_uav.solvers.base import Solver
 
 logger = logging.getLogger(__name__)
@@ -34,13 +34,13 @@ def evaluate(
     """
     Run every solver on every instance, check all schedules, and compare the solvers.
 
-    Writes ``results.csv`` and ``schedules.jsonl``, row by row as results become known; ``evaluation.json``, which tells what
-    was evaluated, with which settings, versions and hashes; and at the end ``summary.csv`` and ``summary.json``. With several
-    sets of instances, the column ``instance`` counts through all of them in the order given. What a solver finds for an
-    instance depends on the seed and the row of the instance in its set.
+    Writes ``results.csv`` and ``schedules.jsonl``, row by row as results become known; ``evaluation.json``, which describes
+    instances, solvers, settings and versions; and at the end ``summary.csv`` and ``summary.json``. With several
+    sets of instances, the column ``instance`` counts through all of them in the order given. The schedule of an
+    instance depends on the seed and on the row of the instance in its set.
 
     A schedule that the checker refuses is written with ``feasible`` False and without an objective. Where a solver refuses the
-    instances or fails on one, ``status`` is ``failed`` and ``message`` says why; the other solvers go on.
+    instances or fails on one, ``status`` is ``failed`` and ``message`` says why; the other solvers are still evaluated.
 
     :param solvers: The solvers, with different names
     :param instances: The instances, or several named sets of them
@@ -51,11 +51,11 @@ def evaluate(
     :param n_jobs: In how many processes to run solvers that treat instances one by one; each has one thread, and their times
         are those of a busy machine. Scripts need the usual ``if __name__ == "__main__"``
     :param reference: Name of the solver that the others are compared with; the first when None
-    :param resume: Go on with the results of the same solvers and instances in the folder, but for failed ones, instead of
-        starting anew. A solver counts as the same if its name and its settings are: change the name when you change its code
+    :param resume: Keep the results of the same solvers and instances in the folder, except failed ones, instead of starting
+        over. Solvers are the same if their names and settings are: change the name when you change the code
     :return: One row per set, time limit and solver, in this order
     :raises ValueError: If there is nothing to do, an argument is not allowed, two solvers have the same name, every solver
-        refuses the instances, the folder cannot be written, or it holds something that cannot be continued
+        refuses the instances, the folder cannot be written, or it holds results that cannot be resumed
     """
     sources = {"instances": instances} if isinstance(instances, Instances) else dict(instances)
     sources = {source: batch.to("cpu") for source, batch in sources.items()}
@@ -76,8 +76,8 @@ def evaluate(
         with EvaluationFolder(out_dir, sources, solvers, run, resume) as folder:
             if folder.changed_versions:
                 changes = ", ".join(folder.changed_versions)
-                logger.warning(f"{out_dir}: holds results of other versions ({changes}); --overwrite starts anew.")
-            # They tell of other results than those that are going to be.
+                logger.warning(f"{out_dir}: holds results of other versions ({changes}); --overwrite starts over.")
+            # They describe the earlier results.
             for name in (SUMMARY_CSV, SUMMARY_JSON):
                 (out_dir / name).unlink(missing_ok=True)
             first_index = 0
@@ -88,7 +88,7 @@ def evaluate(
                         solver.name: evaluation.rows(solver, time_limit, refusals.get((source, solver.name)))
                         for solver in solvers
                     }
-                    summary += summarise(source, results, reference, time_limit)
+                    summary += summarize(source, results, reference, time_limit)
                 first_index += len(batch)
         write_summary(summary, out_dir, {"reference": reference, "seed": seed})
     return summary
@@ -128,12 +128,14 @@ def _check_arguments(
     if seed < 0:
         raise ValueError(f"The seed is {seed}; it must be at least 0.")
     for source, batch in sources.items():
+        if len(batch) == 0:
+            raise ValueError(f"The set {source!r} holds no instances; leave it out.")
         try:
             batch.validate()
         except ValueError as error:
             raise ValueError(f"{source}: {error}") from error
     for time_limit in time_limits:
-        # Whether 0 is enough is for the solver to say.
+        # Each solver decides whether 0 is enough.
         if time_limit is not None and not 0 <= time_limit < math.inf:
             raise ValueError(f"A time limit is {time_limit}; it must be a number of seconds, at least 0.")
         if time_limits.count(time_limit) > 1:
@@ -153,7 +155,7 @@ def _refusals(solvers: Sequence[Solver], sources: Mapping[str, Instances]) -> di
             try:
                 solver.check(batch)
             except Exception as error:
-                # Of whatever kind: the others can do without it.
+                # Any exception: the other solvers are still evaluated.
                 refusals[source, solver.name] = Failure.of(error).message
     if len(refusals) == len(solvers) * len(sources):
         raise ValueError(

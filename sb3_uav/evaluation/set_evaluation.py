@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_uav.envs.instances import Instances
@@ -13,10 +14,11 @@ from sb3_uav.evaluation.parallel import Failure, Runner
 from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, ResultKey, ResultRow, one_line
 from sb3_uav.solvers.base import Solver, SolverResult
 
-# What is done, how many instances of it are done already, and how many there are.
+# Description of the task, number of instances done, number of instances in all.
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(eq=False)
 class SetEvaluation:
     """
     Evaluates solvers on one set of instances.
@@ -25,37 +27,29 @@ class SetEvaluation:
     :param instances: The set, on the CPU
     :param first_index: Index of its first instance in the files
     :param seed: Seed of the solvers
-    :param folder: Where results come from and go to
+    :param folder: Folder of earlier and new results
     :param runner: Runs the solvers
     :param progress: Called before each solver starts and after each of its instances
     """
 
-    def __init__(
-        self,
-        source: str,
-        instances: Instances,
-        first_index: int,
-        seed: int,
-        folder: EvaluationFolder,
-        runner: Runner,
-        progress: Progress | None,
-    ) -> None:
-        self.source = source
-        self.instances = instances
-        self.first_index = first_index
-        self.seed = seed
-        self.folder = folder
-        self.runner = runner
-        self.progress = progress
-        self._n_tasks = instances.task_mask.sum(1).tolist()
-        self._found: dict[tuple[str, float | None], list[ResultRow]] = {}
+    source: str
+    instances: Instances
+    first_index: int
+    seed: int
+    folder: EvaluationFolder
+    runner: Runner
+    progress: Progress | None
+    _found: dict[tuple[str, float | None], list[ResultRow]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self._n_tasks = self.instances.task_mask.sum(1).tolist()
 
     def rows(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
         """
         :param solver: A solver
         :param time_limit: Seconds per instance, if the solver uses them
         :param refusal: Why it cannot solve the set, if it cannot
-        :return: Its results on all instances: those that are there already, and those of now
+        :return: Its results on all instances, earlier and new ones
         """
         time_limit = time_limit if solver.uses_time_limit else None
         if (solver.name, time_limit) not in self._found:
@@ -63,7 +57,7 @@ class SetEvaluation:
         return self._found[solver.name, time_limit]
 
     def _run(self, solver: Solver, time_limit: float | None, refusal: str | None) -> list[ResultRow]:
-        """Find what :meth:`rows` returns."""
+        """Find the results that :meth:`rows` returns."""
         keys = [ResultKey(solver.name, self.first_index + row, time_limit, self.seed) for row in range(len(self.instances))]
         missing = [
             row for row, key in enumerate(keys) if key not in self.folder.rows or self.folder.rows[key].status == FAILED
@@ -88,12 +82,12 @@ class SetEvaluation:
 
     def _add(self, solver: Solver, row: int, time_limit: float | None, result: SolverResult | Failure) -> None:
         """
-        Check a result and write it down.
+        Check a result and add it to the folder.
 
-        :param solver: Whose it is
+        :param solver: The solver
         :param row: Row of its instance in the set
         :param time_limit: Seconds that the solver was given
-        :param result: What it found, or why it did not
+        :param result: The result, or the failure
         """
         report: ScheduleReport | None = None
         status, message = OK, ""
@@ -111,7 +105,7 @@ class SetEvaluation:
                 # JSON has no NaN.
                 line["objective"] = None
         solved = None if isinstance(result, Failure) else result
-        bound = None if solved is None or solved.bound is None or not math.isfinite(solved.bound) else float(solved.bound)
+        bound = None if result.bound is None or not math.isfinite(result.bound) else float(result.bound)
         self.folder.add(
             ResultRow(
                 solver=solver.name,

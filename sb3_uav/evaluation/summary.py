@@ -1,4 +1,4 @@
-"""What the results of an evaluation say: means, gaps, and differences on the same instances."""
+"""Summaries of results: means, gaps, and differences on the same instances."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BOUND_TOLERANCE = 1e-6
 @dataclass(frozen=True)
 class SummaryRow:
     """
-    What one solver achieved on one set of instances. Figures that cannot be told are NaN.
+    The results of one solver on one set of instances. Unknown figures are NaN.
 
     :param solver: Name of the solver
     :param source: Name of the set
@@ -44,8 +44,8 @@ class SummaryRow:
     :param optimality_gap: See :func:`optimality_gap`, in percent, with the best bounds of all solvers
     :param seconds: Mean wall time per instance
     :param batch_size: How many instances were solved at once (the largest batch)
-    :param violations: What the checker said of infeasible schedules and wrong bounds, one line each
-    :param failures: What went wrong, and on how many instances, one line each
+    :param violations: Infeasible schedules and wrong bounds, one line each
+    :param failures: Reasons of failures with the number of instances, one line each
     """
 
     solver: str
@@ -103,7 +103,7 @@ def optimality_gap(objectives: np.ndarray, bounds: np.ndarray) -> float:
     return float(100 * np.mean(distance / np.where(bounds[both] > 0, bounds[both], 1.0)))
 
 
-def summarise(
+def summarize(
     source: str, results: Mapping[str, Sequence[ResultRow]], reference: str, time_limit: float | None = None
 ) -> list[SummaryRow]:
     """
@@ -191,7 +191,7 @@ def _wrong_bounds(rows: Sequence[ResultRow], best_found: np.ndarray) -> list[str
 def _failures(rows: Sequence[ResultRow]) -> tuple[str, ...]:
     """
     :param rows: Results of one solver
-    :return: What went wrong, each message once
+    :return: The reasons, each once
     """
     counts: dict[str, int] = {}
     for row in rows:
@@ -207,9 +207,9 @@ def write_summary(summary: Sequence[SummaryRow], folder: Path, about: Mapping[st
     """
     Write ``summary.csv`` and ``summary.json``. NaN becomes an empty cell and null.
 
-    :param summary: What :func:`summarise` returned
+    :param summary: What :func:`summarize` returned
     :param folder: Where to write
-    :param about: What else ``summary.json`` shall say
+    :param about: Further entries of ``summary.json``
     """
     rows = [
         {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in asdict(row).items()}

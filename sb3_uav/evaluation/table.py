@@ -38,7 +38,7 @@ def print_table(summary: Sequence[SummaryRow]) -> None:
     for _, group in groupby(summary, key=lambda row: (row.source, row.time_limit)):
         table = _table(rich, list(group))
         if not console.is_terminal:
-            # Where the output is no terminal, rich would assume 80 columns and break the names of solvers.
+            # Without a terminal, rich assumes 80 columns and breaks the names of solvers.
             console.width = max(console.measure(table, options=console.options.update(width=10_000)).maximum, 80)
         console.print(table)
 

@@ -74,7 +74,7 @@ class AnnealingSettings(NamedTuple):
 
     :param mean_removed: How many tasks a trial takes out, on average
     :param longest_string: How many tasks at most it takes out of one tour
-    :param n_near: Beside how many neighbours a task may be inserted
+    :param n_near: Beside how many neighbors a task may be inserted
     :param blink: Probability that a trial overlooks a task
     :param noise: By how much the worth of an insertion may be misjudged, as a fraction of it
     :param thrift: What a shorter tour is worth: that part of the value now collected on the same length
@@ -263,7 +263,7 @@ def find_near(nodes, near):
 @njit(cache=True, nogil=True)
 def move_segment(plan, v, first, count, w, place, flip):
     """
-    Move up to three neighbouring tasks of tour ``v`` to ``place`` of tour ``w`` (as numbered before), turned if ``flip``.
+    Move up to three neighboring tasks of tour ``v`` to ``place`` of tour ``w`` (as numbered before), turned if ``flip``.
     """
     route = plan.routes[v]
     a, b, c = route[first], route[first + 1], route[min(first + 2, plan.tours[v].size + 1)]
@@ -354,7 +354,7 @@ def try_two_opt(plan, n_queued, a, b, distance_ab):
     route = plan.routes[v]
     for forward in (True, False):
         q = plan.nodes[b].position if b > 0 else 0 if forward else plan.tours[v].size + 1
-        # The neighbours on the side of the legs that vanish.
+        # The neighbors on the side of the legs that vanish.
         next_a = route[p + 1] if forward else route[p - 1]
         next_b = route[q + 1] if forward else route[q - 1]
         if next_a == b or next_b == a:
@@ -375,7 +375,7 @@ def try_two_opt(plan, n_queued, a, b, distance_ab):
 
 @njit(cache=True, nogil=True)
 def try_exchange(plan, n_queued, a, b, distance_ab):
-    """Swap ``a`` with a neighbour of ``b`` in another tour. Parameters as of :func:`try_segments`."""
+    """Swap ``a`` with a neighbor of ``b`` in another tour. Parameters as of :func:`try_segments`."""
     v, w = plan.nodes[a].owner, plan.nodes[b].owner
     p = plan.nodes[a].position
     before, behind = plan.routes[v, p - 1], plan.routes[v, p + 1]
@@ -473,7 +473,7 @@ def shorten(plan, n_queued, n_near):
     """
     Make tours shorter around the tasks in the queue until nothing changes there.
 
-    :param n_near: How many neighbours of a task to try
+    :param n_near: How many neighbors of a task to try
     :return: Whether anything has changed
     """
     changed = False
@@ -525,7 +525,7 @@ def offer(plan, task, v, a, b):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def offer_at(plan, task, v, a, added):
-    """The same, for those who know already what it adds to the tour."""
+    """The same, when the added length is already known."""
     if added < plan.nodes[task].cost and plan.tours[v].length + added <= plan.state[0].limit:
         plan.nodes[task].cost = added
         plan.nodes[task].tour = v
@@ -544,7 +544,7 @@ def look_everywhere(plan, task):
 
 @njit(cache=True, nogil=True)
 def look_around(plan, task, n_near):
-    """Find the cheapest place of a task beside its ``n_near`` neighbours and the depot; everywhere if that is None."""
+    """Find the cheapest place of a task beside its ``n_near`` neighbors and the depot; everywhere if that is None."""
     if n_near == 0:
         look_everywhere(plan, task)
         return
@@ -617,7 +617,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
     """
     Insert candidates, the one that is worth most per added length first, until none fits.
 
-    :param n_near: How many neighbours of a task to look at; 0 for all
+    :param n_near: How many neighbors of a task to look at; 0 for all
     :param blink: Probability of leaving a new candidate out
     :param spread: Standard noise of the worth
     :return: The number of copied tours
@@ -839,10 +839,10 @@ def eject(plan, n_near, max_string):
 @njit(cache=True, nogil=True)
 def descend(plan, n_near_joined, n_near_inserted, max_string):
     """
-    One round of every neighbourhood.
+    One round of every neighborhood.
 
-    :param n_near_joined: To how many neighbours a task may be joined
-    :param n_near_inserted: Beside how many neighbours a task may be inserted where a string has been taken out
+    :param n_near_joined: To how many neighbors a task may be joined
+    :param n_near_inserted: Beside how many neighbors a task may be inserted where a string has been taken out
     :param max_string: The longest string of tasks that is taken out; 0 for none
     :return: Whether anything has changed
     """

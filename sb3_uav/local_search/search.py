@@ -1,4 +1,4 @@
-"""Better schedules from given ones: local search until nothing changes, and ruin and recreate for as long as one likes."""
+"""Improving schedules: local search until nothing changes, and ruin and recreate for a given time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from sb3_uav.common.random_streams import WARM_UP_SEED, keyed_generator, mixed_state
 from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
@@ -15,14 +16,14 @@ from sb3_uav.envs.schedule import Schedule, ScheduleReport, check_schedule
 from sb3_uav.local_search import kernels
 from sb3_uav.local_search.kernels import AnnealingSettings, Plan
 
-# How many nearest tasks of every task are known.
+# Length of the lists of nearest tasks.
 N_NEAR = 64
-# Local search joins a task to this many neighbours, and looks for an insertion beside so many.
+# Number of neighbors that local search joins a task to, and beside which it looks for an insertion.
 N_NEAR_JOINED, N_NEAR_INSERTED = 10, 16
-# Local search takes strings of at most so many tasks out.
+# Local search removes strings of at most this many tasks.
 MAX_STRING = 3
-# Kernels know values to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are far
-# above what kernels take for rounding errors of lengths.
+# Kernels use values rounded to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are
+# far above the threshold for rounding errors of lengths.
 VALUE_BITS = 36
 # Ruin and recreate returns to Python about this often, in seconds, to look at the clock.
 CHUNK_SECONDS = 0.02
@@ -34,7 +35,7 @@ TRIALS_PER_TASK = 100
 
 class LocalSearch:
     """
-    One instance, prepared for searches from as many schedules as one likes; several threads may search at once.
+    One instance, prepared for searches from any number of schedules; several threads may search at once.
 
     Tasks of value 0 and tasks that no UAV can reach are left out; a schedule loses them.
 
@@ -66,16 +67,18 @@ class LocalSearch:
     def _load(self, schedule: Schedule, seed: int = 0) -> Plan:
         """
         :param schedule: A feasible schedule
-        :param seed: Of the random numbers
-        :return: What kernels work on
+        :param seed: Seed for random numbers
+        :return: The data of the kernels
         """
-        n_uavs, n_tasks = self.instance.n_uavs, len(self._tasks)
+        n_tasks = len(self._tasks)
+        # UAVs beyond the number of tasks are useless, and each costs memory.
+        n_uavs = max(min(self.instance.n_uavs, self.instance.n_tasks), len(schedule.routes))
         nodes = self._nodes.copy()
         nodes["owner"] = -1
         state = np.zeros(1, kernels.STATE)
         state["limit"] = self._limit
-        # The generator must not start from 0.
-        state["random"] = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
+        # The state of the generator must not be 0.
+        state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
         tours = np.zeros(n_uavs, kernels.TOUR)
         for uav, route in enumerate(schedule.routes):
@@ -151,9 +154,9 @@ class LocalSearch:
 
         :param plan: Where to begin
         :param best: The best schedule so far, updated
-        :param start: When the time began
-        :param seconds: Of which length
-        :param settings: See there
+        :param start: Start, in seconds of ``time.perf_counter``
+        :param seconds: Length in seconds
+        :param settings: Settings of ruin and recreate
         """
         n_trials = 10
         now = time.perf_counter()
@@ -169,7 +172,7 @@ def warm_up() -> None:
     """
     Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
     """
-    instance = UniformGenerator(8, n_uavs=2)(1, np.random.default_rng(0))
+    instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
     search.repair(search.improve(Schedule([])))
 
@@ -224,16 +227,16 @@ def repair_best(instance: Instances, schedules: Iterable[Schedule], seconds: flo
 
 def improve(instance: Instances, schedule: Schedule, seconds: float | None = None, seed: int = 0) -> Schedule:
     """
-    Ruin and recreate, for as long as one likes.
+    Ruin and recreate for a given time.
 
-    Strings of neighbouring tasks are taken out of one to three tours and the gaps filled again, with worse schedules accepted
+    Strings of neighboring tasks are taken out of one to three tours and the gaps filled again, with worse schedules accepted
     as in simulated annealing; then the best is repaired. Value comes first, then length.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it; an empty one will do
     :param seconds: Wall time, exceeded only by the last repair, whose last round starts within a second; if None, trials in
         proportion to the number of tasks
-    :param seed: Of the random numbers; without ``seconds`` the same seed gives the same schedule
+    :param seed: Seed for random numbers; without ``seconds`` the same seed gives the same schedule
     :return: A feasible schedule that is not worse: of the same value it is not longer
     :raises InfeasibleScheduleError: If the schedule breaks a constraint
     :raises ValueError: If there is not exactly one instance

@@ -18,13 +18,13 @@ from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import DASHED, MARKERS, SERIES_COLORS, style_axes
 
 PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
-LEGEND_WIDTH = 34
-FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
+_LEGEND_WIDTH = 34
+_FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
 
 
 class Curve(NamedTuple):
     """
-    What one solver found in one set of instances.
+    The results of one solver on one set of instances.
 
     :param solver: Name of the solver
     :param seconds: ``(n_points,)``, mean wall time per instance, in ascending order
@@ -62,10 +62,10 @@ def plot_anytime(
     """
     Draw the mean objective of every solver against its mean wall time, a panel for each set of instances.
 
-    A solver that ran with several time limits is a curve: each of its points is a run of its own, at the time that it really
-    took. One that ran with one or none is a point, and a dashed line to the right of it. Of several seeds the mean is drawn.
-    Bands and bars are 95 % confidence intervals over the instances of what is missing to the best objective that any solver
-    found on the same instance: that some instances allow more than others says nothing about solvers.
+    A solver that ran with several time limits is a curve, with a separate run for each point, at the time that it actually
+    took. A solver that ran with one or none is a point with a dashed line to its right. With several seeds, the mean is drawn.
+    Bands and bars are 95 % confidence intervals, over the instances, of the shortfall from the best objective that any solver
+    found on the same instance: differences between instances do not count.
 
     :param results: Folder that :func:`~sb3_uav.evaluation.run.evaluate` wrote
     :param paths: The ``.png``, ``.pdf`` or ``.svg`` to write, or several
@@ -91,7 +91,7 @@ def plot_anytime(
     figure = new_figure(PANEL_WIDTH, PANEL_HEIGHT * len(panels))
     for axes, panel in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
         _draw_panel(axes, panel, numbers)
-    figure.supxlabel(FOOTNOTE, fontsize=7.5, color="0.4")
+    figure.supxlabel(_FOOTNOTE, fontsize=7.5, color="0.4")
     for path in checked:
         save_figure(figure, path)
     return checked
@@ -174,17 +174,17 @@ def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
     style_axes(axes, title, "seconds per instance (mean)", "objective (mean)", "both")
     axes.set_xscale("log")
     times = np.concatenate([curve.seconds for curve in panel.curves]) if panel.curves else np.ones(1)
-    # A point needs room on both sides, and a line to lead somewhere.
+    # Leave room on both sides of a single point, and for the dashed lines.
     axes.set_xlim(times.min() / 2, times.max() * 2)
-    # Of few decades, their halves are worth a label too.
+    # With few decades, label steps between them too.
     few = times.max() < 100 * times.min()
     axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
     axes.xaxis.set_minor_formatter(ticker.NullFormatter())
     axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda seconds, _: f"{seconds:g}"))
-    # The legend reads from the best down, as the panel does.
+    # The legend lists the best solver first, as in the panel.
     for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
         look = solver_style(numbers[curve.solver])
-        name = textwrap.fill(curve.solver.replace(",", ", "), LEGEND_WIDTH, break_on_hyphens=False)
+        name = textwrap.fill(curve.solver.replace(",", ", "), _LEGEND_WIDTH, break_on_hyphens=False)
         label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
         low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth
         if len(curve.seconds) > 1:

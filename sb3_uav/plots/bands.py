@@ -1,4 +1,4 @@
-"""Learning curves of several algorithms beside each other, with confidence bands."""
+"""Learning curves of several algorithms side by side, with confidence bands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Band(NamedTuple):
 
     :param x: ``(n,)``
     :param mean: ``(n,)``
-    :param half_width: ``(n,)``, of the confidence interval; NaN where there is none
+    :param half_width: ``(n,)``, half of the confidence interval; NaN where there is none
     """
 
     x: np.ndarray
@@ -44,9 +44,9 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
     """
     Draw curves with bands, with one legend for all panels.
 
-    :param lines: Panels beside each other, line by line
+    :param lines: Panels, row by row
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
-    :raises ValueError: If there is nothing to draw, or the suffix of the file is another one
+    :raises ValueError: If there is nothing to draw, or the file has another suffix
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
@@ -78,8 +78,8 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
 
 def visible_range(bands: Collection[Band]) -> tuple[float, float]:
     """
-    What of the vertical axis to show: all of the bands, but no more than three times the range of the curves, because
-    intervals of two or three seeds may be so wide that the curves become flat lines.
+    Visible range of the vertical axis: all bands, but at most three times the range of the curves, because intervals of two or
+    three seeds can be so wide that the curves look flat.
 
     :param bands: The curves of a panel
     :return: Lower and upper end

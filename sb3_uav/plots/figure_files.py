@@ -1,4 +1,4 @@
-"""Figures without pyplot's global state, and how they reach the disk."""
+"""Creating and saving figures without pyplot's global state."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SUFFIXES = (".png", ".pdf", ".svg")
 
 def checked_path(path: str | os.PathLike[str]) -> Path:
     """
-    :param path: Where a figure is going to be written
-    :return: The same
+    :param path: Output path of a figure
+    :return: The path as a ``Path``
     :raises ValueError: If its suffix is not one of :data:`SUFFIXES`
     """
     path = Path(path)
@@ -27,23 +27,23 @@ def checked_path(path: str | os.PathLike[str]) -> Path:
 
 def new_figure(width: float, height: float) -> Any:
     """
-    :param width: In inches
-    :param height: In inches
+    :param width: Width in inches
+    :param height: Height in inches
     :return: An empty matplotlib figure that lays itself out
     :raises ImportError: If matplotlib is not installed
     """
     return require_matplotlib().figure.Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Any, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+def save_figure(figure: Any, path: Path, metadata: Mapping[str, str | None] | None = None) -> None:
     """
     Write a figure under a temporary name and rename it.
 
     :param figure: The figure
     :param path: From :func:`checked_path`; its folder is created if missing
-    :param metadata: Written into the file, under keys that its format has
+    :param metadata: Written into the file, under keys that its format has; None leaves out what is written by default
     """
     with temporary_name(path) as temporary:
-        # Legends below a map lie outside its axes, which the layout does not always leave room for.
+        # The layout does not always leave room for legends outside the axes.
         kind = path.suffix[1:].lower()
         figure.savefig(temporary, format=kind, dpi=150, bbox_inches="tight", pad_inches=0.12, metadata=metadata)

@@ -15,9 +15,9 @@ from sb3_uav.plots.style import GREEN, MAX_MARKERS, ORANGE, SKY_BLUE, style_axes
 LOG_FILE = "its_log.csv"
 LEVELS = ("allocator", "router")
 COLUMNS = {"epoch", "level", "phase", "objective"}
-PHASE_COLORS = {"pre-training": SKY_BLUE, "intensive": ORANGE, "alternate": GREEN}
-SPELLINGS = {"pretraining": "pre-training"}
-LINE_COLOR = "#222222"
+_PHASE_COLORS = {"pre-training": SKY_BLUE, "intensive": ORANGE, "alternate": GREEN}
+_SPELLINGS = {"pretraining": "pre-training"}
+_LINE_COLOR = "#222222"
 
 
 class LoggedEpoch(NamedTuple):
@@ -39,7 +39,7 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
     :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
     :raises FileNotFoundError: If there is no such log
-    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers, or the suffix of the
+    :raises ValueError: If the log has no epochs, misses a column or holds something other than numbers, or the suffix of the
         figure is not allowed
     :raises ImportError: If matplotlib is not installed
     """
@@ -57,7 +57,7 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
     :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :return: The epochs of each level, in order; a level may have none
     :raises FileNotFoundError: If there is no such log
-    :raises ValueError: If the log has no epochs, misses a column or holds something else than numbers
+    :raises ValueError: If the log has no epochs, misses a column or holds something other than numbers
     """
     its_log = Path(its_log)
     if its_log.is_dir():
@@ -74,7 +74,7 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
             where = f"{its_log}, line {reader.line_num}"
             if row["level"] not in epochs:
                 raise ValueError(f"{where}: level is {row['level']!r}, expected one of {LEVELS}.")
-            phase = SPELLINGS.get(row["phase"], row["phase"])
+            phase = _SPELLINGS.get(row["phase"], row["phase"])
             try:
                 epochs[row["level"]].append(LoggedEpoch(int(row["epoch"]), phase, float(row["objective"])))
             except (TypeError, ValueError) as error:
@@ -89,7 +89,7 @@ def _draw_level(axes: Any, title: str, epochs: Sequence[LoggedEpoch]) -> None:
     """
     :param axes: matplotlib axes
     :param title: Title of the panel
-    :param epochs: Of one level, in order
+    :param epochs: Epochs of one level, in order
     """
     style_axes(axes, title, "epoch", "tasks completed (mean)")
     if not epochs:
@@ -100,14 +100,14 @@ def _draw_level(axes: Any, title: str, epochs: Sequence[LoggedEpoch]) -> None:
     labeled: set[str] = set()
     for phase, run in groupby(epochs, key=lambda epoch: epoch.phase):
         numbers = [epoch.epoch for epoch in run]
-        if phase not in PHASE_COLORS:
+        if phase not in _PHASE_COLORS:
             continue
         label = None if phase in labeled else phase
         labeled.add(phase)
-        axes.axvspan(numbers[0] - 0.5, numbers[-1] + 0.5, color=PHASE_COLORS[phase], alpha=0.2, linewidth=0, label=label)
+        axes.axvspan(numbers[0] - 0.5, numbers[-1] + 0.5, color=_PHASE_COLORS[phase], alpha=0.2, linewidth=0, label=label)
     marker = "o" if len(epochs) <= MAX_MARKERS else None
     numbers, objectives = [epoch.epoch for epoch in epochs], [epoch.objective for epoch in epochs]
-    axes.plot(numbers, objectives, color=LINE_COLOR, linewidth=1.5, marker=marker, markersize=4)
+    axes.plot(numbers, objectives, color=_LINE_COLOR, linewidth=1.5, marker=marker, markersize=4)
     axes.set_xlim(numbers[0] - 0.5, numbers[-1] + 0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
     if labeled:

@@ -1,4 +1,4 @@
-"""Schedules drawn on a map, one or several beside each other (paper, Fig. 3)."""
+"""Schedules drawn on a map, one or several side by side (paper, Fig. 3)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.render import draw_map
+from sb3_uav.envs.render import draw_map, legend_lines
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 
 PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
-# Two UAVs stand side by side in the legend below a map.
-LEGEND_LINE_HEIGHT = 0.2
+_LEGEND_LINE_HEIGHT = 0.2
 MAX_COLUMNS = 4
 
 
@@ -23,7 +22,7 @@ class MapPanel(NamedTuple):
     One map of a figure.
 
     :param instances: The instances
-    :param row: Which of them
+    :param row: Index of the instance
     :param schedule: What to draw
     :param title: Title of the panel
     """
@@ -39,11 +38,11 @@ def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str 
     Draw one schedule: the depot, tours colored by UAV, skipped tasks hollow, counts and lengths in the legend.
 
     :param instances: The instances
-    :param row: Which of them
+    :param row: Index of the instance
     :param schedule: The schedule
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
     :param title: Title of the figure
-    :raises ValueError: If the suffix of the file is another one
+    :raises ValueError: If the file has another suffix
     :raises ImportError: If matplotlib is not installed
     """
     plot_schedules([MapPanel(instances, row, schedule, title)], path)
@@ -51,11 +50,11 @@ def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str 
 
 def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> None:
     """
-    Draw several schedules beside each other, :data:`MAX_COLUMNS` in a line.
+    Draw several schedules side by side, :data:`MAX_COLUMNS` in a row.
 
     :param panels: What to draw
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
-    :raises ValueError: If there are no panels, or the suffix of the file is another one
+    :raises ValueError: If there are no panels, or the file has another suffix
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
@@ -65,7 +64,7 @@ def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> 
 def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -> Any:
     """
     :param panels: What to draw
-    :param n_columns: How many of them stand in a line
+    :param n_columns: Number of panels in a row
     :return: A matplotlib figure
     :raises ValueError: If there are no panels
     :raises ImportError: If matplotlib is not installed
@@ -74,14 +73,12 @@ def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -
         raise ValueError("There is nothing to draw: give at least one panel.")
     n_columns = min(len(panels), n_columns)
     n_lines = math.ceil(len(panels) / n_columns)
-    # Depot and skipped tasks have entries too.
-    legend_lines = math.ceil((2 + max(len(panel.schedule.routes) for panel in panels)) / 2)
-    height = PANEL_HEIGHT + LEGEND_LINE_HEIGHT * legend_lines
+    height = PANEL_HEIGHT + _LEGEND_LINE_HEIGHT * max(legend_lines(panel.schedule.routes) for panel in panels)
     figure = new_figure(PANEL_WIDTH * n_columns, height * n_lines)
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):
         draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
-        # What room there is too much belongs to the legend.
+        # Extra vertical space goes to the legend.
         axes.set_anchor("N")
     for axes in grid[len(panels) :]:
         axes.set_axis_off()

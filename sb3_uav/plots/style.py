@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_uav.envs.render import UAV_COLOURS
+from sb3_uav.envs.render import UAV_COLORS
 
 # Okabe and Ito's palette, readable with color-vision deficiencies; the same as on maps.
-SERIES_COLORS = UAV_COLOURS
+SERIES_COLORS = UAV_COLORS
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY_BLUE = SERIES_COLORS[:6]
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LINE_STYLES = ("-", "--", ":", "-.")

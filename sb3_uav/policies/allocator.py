@@ -1,4 +1,4 @@
-"""The allocator: gives every task, one after the other, to a UAV (paper, section IV-A2)."""
+"""The allocator: assigns every task, one after the other, to a UAV (paper, section IV-A2)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.distributions import MaskableDistribution
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
@@ -23,18 +21,19 @@ from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
 
 # Hidden size of the scorer.
 SCORER_DIM = 64
-# What the scorer adds up before training: the untrained allocator gives a task to the UAV that has its neighbors, until that
-# UAV has about its share. Decoded greedily, this is about as good as a trained allocator.
+# Weights of the scorer before training: an untrained allocator assigns a task to the UAV that has its neighbors until that UAV
+# has about its share of the tasks. Decoded greedily, this is about as good as a trained allocator.
 INITIAL_SCORE = {
-    # From 95 % of its share on, every further per cent makes a UAV e^0.6 times less likely: one task over the share outweighs
-    # all votes with up to 50 tasks per UAV, and later ones do beyond that.
+    # Beyond 95 % of its share, every further percent makes a UAV e^0.6 times less likely: with 50 tasks per UAV, one task over
+    # the share outweighs all votes.
     FleetFeature.OVERLOAD: -60.0,
-    # A UAV that has all the neighbors is e^4, about 50 times likelier than one that has none of them.
+    # A UAV that has all the neighbors is e^4 (about 50) times more likely than one that has none of them.
     FleetFeature.VOTES: 4.0,
-    # Twice as far away from the task is 2^-0.5 times as likely, so that distance decides between equal votes only.
+    # Doubling the distance makes a UAV 2^0.5 times less likely: distance decides between UAVs with equal votes only.
     FleetFeature.RELATIVE_DISTANCE: -0.5,
 }
 
@@ -54,9 +53,9 @@ class AllocatorCache(Cache):
 class AllocatorState(NamedTuple):
     """
     :param context: ``(batch, n_samples, n_uavs, embed_dim)``, element-wise maximum of the embeddings of the depot and of the
-        UAV's tasks (paper, equation (16))
+        UAV's tasks (paper, equation (15))
     :param task: ``(batch, n_samples)`` int64, the task to allocate
-    :param features: ``(batch, n_samples, n_uavs, len(FleetFeature))``, how the task fits to each UAV; None without geometry
+    :param features: ``(batch, n_samples, n_uavs, len(FleetFeature))``, fit of the task to each UAV; None without geometry
     """
 
     context: th.Tensor
@@ -66,10 +65,10 @@ class AllocatorState(NamedTuple):
 
 class SharedScorer(nn.Module):
     """
-    Judges how well a task fits to a UAV, with the same parameters for every UAV.
+    Scores how well a task fits a UAV, with the same parameters for every UAV.
 
     :param embed_dim: Size of the embeddings
-    :param geometry: Whether it is told distances and loads
+    :param geometry: Whether distances and loads are inputs
     """
 
     def __init__(self, embed_dim: int, geometry: bool) -> None:
@@ -104,9 +103,9 @@ class SharedScorer(nn.Module):
 
 class AllocatorExtractor(EpisodicExtractor):
     """
-    Features = [task subset embedding, embedding of the current task] (paper, equations (16) to (18)).
+    Features = [task subset embedding, embedding of the current task] (paper, equations (15) to (17)).
 
-    With ``net_arch=[]`` on top, SB3's action layer is the paper's last equation (19).
+    With ``net_arch=[]`` on top, SB3's action layer and the softmax are the paper's equation (18).
     With ``shared_scorer`` they are [score of every UAV, embedding of the current task], and the scores are the logits.
 
     :param observation_space: Observation space of a ``TaskAllocation`` environment
@@ -118,6 +117,7 @@ class AllocatorExtractor(EpisodicExtractor):
     environment = "TaskAllocation"
     own_key = "assignment"
 
+    @float32_on_cpu()
     def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
         network = NetworkSettings.of(settings)
         n_uavs, embed_dim = self.n_actions(observation_space), network.embed_dim
@@ -147,7 +147,7 @@ class AllocatorExtractor(EpisodicExtractor):
         final = assignment.gather(1, current_task.argmax(1)[:, None, None].expand(-1, 1, n_tasks))
         decided = th.arange(n_tasks, device=assignment.device) < current_task[..., None]
         if assignment.shape[1] > 1 and (assignment == final.where(decided, UNASSIGNED)).all():
-            # Steps of one episode: one running maximum serves them all.
+            # Steps of one episode share one running maximum.
             mine = final[..., None] == uavs
             context = at_steps(self.running_context(cache, mine), current_task)
             if geometry is not None:
@@ -164,10 +164,10 @@ class AllocatorExtractor(EpisodicExtractor):
 
     def running_context(self, cache: Cache, mine: th.Tensor) -> th.Tensor:
         """
-        What every UAV holds before and after each step of complete episodes.
+        Context of every UAV before and after each step of complete episodes.
 
-        :param cache: Of ``batch`` instances
-        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is
+        :param cache: Encodings of ``batch`` instances
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, True where the task belongs to the UAV
         :return: ``(batch, n_samples, n_tasks + 1, n_uavs, embed_dim)``
         """
         depot, tasks = cache.nodes[:, None, :1, None], cache.nodes[:, None, 1:, None]
@@ -176,7 +176,7 @@ class AllocatorExtractor(EpisodicExtractor):
 
     def initial_context(self, cache: Cache, n_samples: int, n_uavs: int) -> th.Tensor:
         """
-        :param cache: Of ``batch`` instances
+        :param cache: Encodings of ``batch`` instances
         :param n_samples: Episodes per instance
         :param n_uavs: Size of the fleet
         :return: ``(batch, n_samples, n_uavs, embed_dim)``, the depot's embedding everywhere
@@ -196,9 +196,9 @@ class AllocatorExtractor(EpisodicExtractor):
 
 def at_steps(running: th.Tensor, steps: th.Tensor) -> th.Tensor:
     """
-    :param running: ``(batch, 1, n_steps, ...)``, something at every step of an episode
+    :param running: ``(batch, 1, n_steps, ...)``, a quantity at every step of an episode
     :param steps: ``(batch, n_samples)`` int64
-    :return: ``(batch, n_samples, ...)``, the same at these steps
+    :return: ``(batch, n_samples, ...)``, the quantity at these steps
     """
     index = steps.view(*steps.shape, *[1] * (running.dim() - 3)).expand(-1, -1, *running.shape[3:])
     return running[:, 0].gather(1, index)
@@ -208,7 +208,7 @@ class AllocatorPolicy(EpisodicPolicy):
     """
     The upper level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments.
 
-    The number of tasks is free, and with ``shared_scorer`` that of UAVs too; the paper's decoder is bound to one.
+    It takes any number of tasks and, with ``shared_scorer``, of UAVs; the paper's decoder is bound to one fleet size.
     """
 
     extractor_class = AllocatorExtractor
@@ -222,38 +222,36 @@ class AllocatorPolicy(EpisodicPolicy):
 
     @property
     def n_uavs(self) -> int | None:
-        """The fleet size that the network was made for; None if it serves any."""
+        """The fleet size the network was built for; None if it works for any."""
         return self.features_extractor.n_uavs
 
     @property
     def sweep(self) -> bool:
-        """Whether the tasks should be swept around the depot."""
+        """Whether tasks are allocated in the order of a sweep around the depot."""
         return self.settings.sweep
 
     @property
     def env_order(self) -> str:
-        """The ``task_order`` of the environments that suit it."""
+        """The ``task_order`` an environment should have for this policy."""
         return "sweep" if self.sweep else "input"
 
-    def _decode_observation(
-        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
-    ) -> tuple[MaskableDistribution, th.Tensor]:
-        if self.sweep and not self._order_is_checked:
+    def _decode_observation(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        if self.sweep and not self._order_is_checked and not is_recorded():
             self._order_is_checked = True
             assert isinstance(obs, dict)
             self._check_order(StaticObservation.from_observation(obs))
-        return super()._decode_observation(obs, action_masks)
+        return super()._decode_observation(obs)
 
     def _check_order(self, static: StaticObservation) -> None:
-        """Warn if the tasks of the first observations are not in the order that the allocator wants."""
+        """Warn if the tasks of the first observations are not in the order of a sweep."""
         depot, tasks, values, max_distance = static.depot, static.tasks, static.values, static.max_distance[:, 0]
         order = sweep_order(Instances(depot, tasks, values, max_distance, 1, static.task_mask))
-        # Observations are rounded, which may exchange a few tasks.
+        # Rounding of the observations may swap a few tasks.
         if (order == th.arange(order.shape[1], device=order.device)).float().mean() < 0.5:
             warnings.warn(
-                "This AllocatorPolicy wants the tasks in the order of a sweep around the depot, but the environment shows "
-                'them in another one, and schedules will be worse: make it with task_order="sweep", or the policy with '
-                "sweep=False.",
+                "This AllocatorPolicy expects the tasks in the order of a sweep around the depot, but the environment shows "
+                'them in another order, which makes schedules worse: create the environment with task_order="sweep", or the '
+                "policy with sweep=False.",
                 stacklevel=4,
             )
 

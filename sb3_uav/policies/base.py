@@ -28,13 +28,14 @@ from sb3_uav.policies.grouping import EPISODE_INDEX
 from sb3_uav.policies.memory import rows_that_fit
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
 
 SelfPolicy = TypeVar("SelfPolicy", bound="EpisodicPolicy")
 
 
 class EpisodeEvaluation(NamedTuple):
     """
-    Complete episodes in the eyes of the current policy; every tensor is ``(batch, n_samples, n_steps)``.
+    The current policy's view of complete episodes; every tensor is ``(batch, n_samples, n_steps)``.
 
     :param log_prob: Log-probability of each action; 0 in steps after the end
     :param values: The critic's estimate before each action
@@ -48,7 +49,7 @@ class EpisodeEvaluation(NamedTuple):
 
 def sample_actions(logits: th.Tensor, deterministic: bool, generator: th.Generator | None) -> th.Tensor:
     """
-    Choose actions; one of probability 0 is never chosen.
+    Choose actions; an action of probability 0 is never chosen.
 
     :param logits: ``(..., n_actions)``, -inf where an action is illegal
     :param deterministic: Whether to take the most probable action instead of sampling
@@ -69,8 +70,8 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     The mask comes from ``observation["action_mask"]`` when the algorithm passes no ``action_masks``, so it cannot be
     forgotten. Its networks work for any number of tasks; the observation space binds only SB3's step loop to one.
 
-    :param observation_space: Of one of our environments
-    :param action_space: Of the same environment
+    :param observation_space: Observation space of one of our environments
+    :param action_space: Action space of the same environment
     :param lr_schedule: Learning rate schedule (could be constant)
     :param preset: ``"default"``, or ``"paper"`` for the network of the paper
     :param net_arch: Hidden layers between features and heads, as in SB3; none by default
@@ -87,6 +88,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     extractor_class: ClassVar[type[EpisodicExtractor]]
     features_extractor: EpisodicExtractor
 
+    @float32_on_cpu()
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -129,9 +131,9 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     @abstractmethod
     def placeholder_spaces(cls, n_actions: int | None) -> tuple[spaces.Dict, spaces.Discrete]:
         """
-        Spaces of some small instance, for a policy that will only be used through the fused driver.
+        Spaces of a small instance, for a policy that is used only through the fused driver.
 
-        :param n_actions: Number of actions where the network is bound to it
+        :param n_actions: Number of actions, where the network depends on it
         :return: Observation space, action space
         """
 
@@ -149,15 +151,15 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
     def rows_that_fit(self, n_nodes: int, n_subsets: int = 0) -> int:
         """
         :param n_nodes: Nodes of each instance, the depot included
-        :param n_subsets: Into how many subsets each is going to be split at once
-        :return: How many instances this policy can treat at once, at least 1
+        :param n_subsets: Number of subsets into which each instance is split at once
+        :return: Number of instances this policy can process at once, at least 1
         """
         return rows_that_fit(self.device, n_nodes, n_subsets)
 
     # ---------------------------------------------------------------------------------------------------- heads
 
     def _build_mlp_extractor(self) -> None:
-        # Where features begin with logits, whose number varies, the critic's layers see only what follows.
+        # Where features begin with logits, whose number varies, only what follows is input of the critic's layers.
         features_dim = self.features_dim
         self.features_dim = self.features_extractor.context_dim or features_dim
         super()._build_mlp_extractor()
@@ -186,18 +188,18 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
 
     def task_order(self, instances: Instances, variant: int = 0) -> th.Tensor:
         """
-        The order in which the policy wants to meet the tasks.
+        The policy's preferred order of the tasks.
 
         :param instances: ``batch`` instances
-        :param variant: 0 for the best order it knows; others are worth a try
-        :return: ``(batch, n_tasks)`` int64, which task comes first, second, ...
+        :param variant: 0 for the order used in greedy decoding; others give alternatives to sample from
+        :return: ``(batch, n_tasks)`` int64, index of the first task, the second, ...
         """
         return th.arange(instances.n_tasks, device=instances.device).expand(len(instances), -1)
 
     def arrange(self, instances: Instances) -> Instances:
         """
         :param instances: Any instances
-        :return: They with their tasks in the order in which the policy wants them
+        :return: The instances, tasks in the policy's preferred order
         """
         return instances.reorder(self.task_order(instances))
 
@@ -249,11 +251,11 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         :param n_samples: Episodes per instance, all from one encoding
         :param deterministic: Whether to take the most probable action instead of sampling
         :param generator: Source of randomness, on the same device
-        :param cache: The encodings, if there are any already
+        :param cache: Encodings of the instances; computed here when None
         :return: Actions ``(batch, n_samples, n_steps)`` int64
         """
         if cache is None:
-            # As predict does; a caller that trains brings the encodings along.
+            # As predict does; a caller that trains passes the encodings.
             self.set_training_mode(False)
             cache = self.encode(instances)
         return self._decode_episodes(instances, cache.detach(), n_samples, deterministic, generator)
@@ -264,7 +266,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
 
         :param instances: ``batch`` instances on the device of the policy
         :param actions: ``(batch, n_samples, n_steps)`` int64, legal ones
-        :param cache: The encodings, if there are any already
+        :param cache: Encodings of the instances; computed here when None
         :return: Log-probabilities, values and entropies
         """
         cache = self.encode(instances) if cache is None else cache
@@ -272,58 +274,101 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         logits, values = self.decode_step(cache, state)
         log_probs = logits.masked_fill(~action_mask, -th.inf).log_softmax(-1)
         log_prob = log_probs.gather(-1, actions.flatten(1)[..., None]).squeeze(-1)
-        # 0 * -inf is NaN, in the gradient too, so illegal actions are taken out before the product.
+        # 0 * -inf is NaN, also in the gradient, so illegal actions are removed before the product.
         legal_log_probs = log_probs.masked_fill(~action_mask, 0.0)
         entropy = -(legal_log_probs.exp() * legal_log_probs).sum(-1)
         return EpisodeEvaluation(*(field.view(actions.shape) for field in (log_prob, values, entropy)))
 
     # ---------------------------------------------------------------------------------------------------- SB3's step loop
 
-    def _decode_observation(
-        self, obs: PyTorchObs, action_masks: np.ndarray | th.Tensor | None
-    ) -> tuple[MaskableDistribution, th.Tensor]:
+    def _decode_observation(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param obs: ``batch`` observations
-        :param action_masks: The mask of each; that of the observation when None
-        :return: The masked distribution, and the values ``(batch,)``
+        :return: Unmasked logits ``(batch, n_actions)``, values ``(batch,)``
         """
         assert isinstance(obs, dict)
-        # The index is no part of the observation space, which preprocessing goes through.
+        # The index is not part of the observation space, whose keys preprocessing expects.
         observation = {key: value for key, value in obs.items() if key != EPISODE_INDEX}
         preprocessed = preprocess_obs(observation, self.observation_space, normalize_images=False)
         assert isinstance(preprocessed, dict)
         if EPISODE_INDEX in obs:
             preprocessed[EPISODE_INDEX] = obs[EPISODE_INDEX]
-        features = self.features_extractor(preprocessed)
-        logits, values = self._heads(features)
+        return self._heads(self.features_extractor(preprocessed))
+
+    def _mask(self, obs: PyTorchObs, logits: th.Tensor, action_masks: np.ndarray | th.Tensor | None) -> th.Tensor:
+        """
+        :param obs: ``batch`` observations
+        :param logits: ``(batch, n_actions)``
+        :param action_masks: The mask of each; that of the observation when None
+        :return: ``(batch, n_actions)`` bool
+        :raises ValueError: If a row has no legal action
+        """
+        assert isinstance(obs, dict)
+        given = obs["action_mask"] if action_masks is None else action_masks
+        mask = th.as_tensor(given, dtype=th.bool, device=logits.device).reshape(logits.shape)
+        if is_recorded():
+            return mask
+        legal = mask.any(-1)
+        if not legal.all():
+            rows = (~legal).nonzero()[:, 0].tolist()
+            source = 'observation["action_mask"]' if action_masks is None else "action_masks"
+            raise ValueError(
+                f"{source} allows no action in row {rows[0]} ({len(rows)} of {len(legal)} rows); set at least one entry of "
+                "each row to 1, and reset an environment whose episode is over before asking for its next action."
+            )
+        return mask
+
+    def _distribution(
+        self, obs: PyTorchObs, logits: th.Tensor, action_masks: np.ndarray | th.Tensor | None
+    ) -> MaskableDistribution:
+        """
+        :param obs: ``batch`` observations
+        :param logits: ``(batch, n_actions)``
+        :param action_masks: The mask of each; that of the observation when None
+        :return: The masked distribution
+        :raises ValueError: If a row has no legal action
+        """
+        mask = self._mask(obs, logits, action_masks)
         distribution = self.action_dist.proba_distribution(action_logits=logits)
-        distribution.apply_masking(obs["action_mask"].bool() if action_masks is None else action_masks)
-        return distribution, values
+        distribution.apply_masking(mask)
+        return distribution
 
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        distribution, values = self._decode_observation(obs, action_masks)
+        logits, values = self._decode_observation(obs)
+        if is_recorded():
+            # torch's distributions look at the numbers to validate them, which cannot be exported.
+            masked = logits.masked_fill(~self._mask(obs, logits, action_masks), -th.inf)
+            actions = sample_actions(masked, deterministic, None)
+            return actions, values[:, None], masked.log_softmax(-1).gather(-1, actions[:, None])[:, 0]
+        distribution = self._distribution(obs, logits, action_masks)
         actions = distribution.get_actions(deterministic=deterministic)
         return actions, values[:, None], distribution.log_prob(actions)
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: th.Tensor, action_masks: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        distribution, values = self._decode_observation(obs, action_masks)
+        logits, values = self._decode_observation(obs)
+        distribution = self._distribution(obs, logits, action_masks)
         return values[:, None], distribution.log_prob(actions), distribution.entropy()
 
     def get_distribution(self, obs: PyTorchObs, action_masks: np.ndarray | None = None) -> MaskableDistribution:
-        return self._decode_observation(obs, action_masks)[0]
+        return self._distribution(obs, self._decode_observation(obs)[0], action_masks)
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
-        return self._decode_observation(obs, None)[1][:, None]
+        return self._decode_observation(obs)[1][:, None]
+
+    def masked_logits(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: ``batch`` observations
+        :return: ``(batch, n_actions)``, -inf where an action is illegal
+        :raises ValueError: If a row has no legal action
+        """
+        logits = self._decode_observation(obs)[0]
+        return logits.masked_fill(~self._mask(obs, logits, None), -th.inf)
 
     # ---------------------------------------------------------------------------------------------------- parameters
-
-    def load_from_vector(self, vector: np.ndarray) -> None:
-        self.features_extractor.clear_cache()
-        super().load_from_vector(vector)
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, th.Tensor], policy_kwargs: dict[str, Any], device: Any) -> Any:
@@ -331,8 +376,8 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         Build a policy for the fused driver from a state dict.
 
         :param parameters: The state dict of a policy of this class
-        :param policy_kwargs: The arguments it was built with
-        :param device: Where to put it
+        :param policy_kwargs: The arguments the policy was built with
+        :param device: Device of the policy
         :return: The policy, in evaluation mode
         :raises ValueError: If the state dict does not fit the arguments
         """

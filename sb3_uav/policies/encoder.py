@@ -11,6 +11,7 @@ from torch.nn import functional
 from sb3_uav.policies.geometry import NodeFeature, node_features, scaled_coordinates
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import is_recorded
 
 # The strongest preference for near nodes that a head starts with: e^-1 at 1/16 of the maximum flight distance.
 LOCALITY = 256.0
@@ -58,7 +59,7 @@ class NodeNorm(nn.Module):
 
     Batch normalization is the paper's. Its statistics differ between acting and training, which breaks PPO's ratios, so it is
     the default of the ``paper`` preset only. Normalization per instance learned somewhat faster than per node (``"layer"``)
-    at a learning rate of 1e-3, and went on learning at 3e-3, where that stalled.
+    at a learning rate of 1e-3, and still learned at 3e-3, where per node stalled.
 
     :param kind: ``"instance"``, ``"batch"``, ``"layer"`` or ``"none"``
     :param embed_dim: Size of the embeddings
@@ -84,14 +85,15 @@ class NodeNorm(nn.Module):
             return self.norm(nodes, node_mask)
         if not isinstance(self.norm, nn.BatchNorm1d):
             return self.norm(nodes)
-        if node_mask is None:
+        if node_mask is None or not self.norm.training:
+            # In evaluation mode no node has an influence on another.
             return self.norm(nodes.flatten(0, 1)).view_as(nodes)
         return nodes.masked_scatter(node_mask[..., None], self.norm(nodes[node_mask]))
 
 
 class SelfAttention(nn.Module):
     """
-    Multi-head self-attention without biases (paper, equations (11) to (13)).
+    Multi-head self-attention without biases (paper, equations (10) to (12)).
 
     :param embed_dim: Size of the embeddings
     :param n_heads: Number of heads
@@ -101,7 +103,7 @@ class SelfAttention(nn.Module):
     def __init__(self, embed_dim: int, n_heads: int, relative: bool = False) -> None:
         super().__init__()
         self.n_heads = n_heads
-        # From heads that look everywhere to heads that look nearby.
+        # From heads that attend to all nodes alike to heads that attend to near ones.
         slopes = LOCALITY ** th.linspace(0.0, 1.0, n_heads)
         self.log_locality = nn.Parameter(slopes.log()) if relative else None
         self.project_in = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
@@ -118,7 +120,7 @@ class SelfAttention(nn.Module):
         if self.log_locality is None or coordinates is None:
             return self.project_out(attend(query, key, value, self.n_heads, attention_bias))
         # -slope * |a - b|^2 is, but for a term in a alone that softmax ignores, the product of (2 a, -1) and (b, |b|^2): four
-        # more columns of queries and keys, so that the fused kernel can go on without a matrix of scores.
+        # more columns of queries and keys, so that the fused kernel needs no matrix of scores.
         query, key, value = (part.unflatten(-1, (self.n_heads, -1)).transpose(1, 2).float() for part in (query, key, value))
         head_dim = query.shape[-1]
         slope = self.log_locality.exp()[:, None, None]
@@ -140,13 +142,13 @@ def fused_attention(
     Torch's fused kernel, always in float32, autocast or not.
 
     With such small heads bfloat16 saves nothing on a CPU, its backward pass takes two to eight times as long
-    (``benchmarks/attention.py``), and it would round the positions that relative attention is told.
+    (``benchmarks/attention.py``), and it would round the positions that relative attention compares.
 
     :param query: ``(batch, n_heads, n_queries, head_dim)``
     :param key: ``(batch, n_heads, n_nodes, head_dim)``
     :param value: ``(batch, n_heads, n_nodes, head_dim)``
     :param attention_bias: Added to the scores, or None
-    :param scale: Of the scores; one over the root of ``head_dim`` when None
+    :param scale: Factor of the scores; one over the root of ``head_dim`` when None
     :return: ``(batch, n_heads, n_queries, head_dim)``
     """
     with th.autocast(query.device.type, enabled=False):
@@ -183,7 +185,7 @@ def feed_forward(embed_dim: int, ff_dim: int) -> nn.Sequential:
 
 class AttentionLayer(nn.Module):
     """
-    Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (14), (15)).
+    Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (13) and (14)).
 
     :param settings: Shape of the network
     """
@@ -233,7 +235,7 @@ class AttentionEncoder(nn.Module):
     def forward(self, static: StaticObservation) -> th.Tensor:
         """
         :param static: The unchanging part of a batch of observations
-        :return: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first; those of padded tasks mean nothing
+        :return: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first; those of padded tasks are arbitrary
         """
         depot, features, coordinates = static.depot, static.tasks, None
         if self.relative:
@@ -244,7 +246,8 @@ class AttentionEncoder(nn.Module):
             features = th.cat([features, static.values[..., None]], dim=-1)
         nodes = th.cat([self.embed_depot(depot)[:, None], self.embed_task(features)], dim=1)
         node_mask, attention_bias = None, None
-        if not static.task_mask.all():
+        # A recording must serve padded instances too.
+        if is_recorded() or not static.task_mask.all():
             node_mask = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)
             attention_bias = th.zeros_like(node_mask, dtype=th.float32).masked_fill(~node_mask, -th.inf)[:, None, None]
         # Sums and norms stay in float32.

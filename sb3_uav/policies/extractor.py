@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -17,6 +17,7 @@ from sb3_uav.policies.encoder import AttentionEncoder
 from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import ModuleContents, is_recorded
 
 CacheT = TypeVar("CacheT", bound="Cache")
 
@@ -77,13 +78,28 @@ def _map_tensors(function: Callable[..., th.Tensor], first: Any, *others: Any) -
     return type(first)(*(_map_tensors(function, *parts) for parts in zip(first, *others, strict=True)))
 
 
+class _Kept(NamedTuple):
+    """
+    Encodings, and everything that they depend on.
+
+    :param contents: Parameters and buffers of the extractor
+    :param static: Copy of the observations, because an environment may write its next one into the same memory
+    :param cache: Their encodings, the level's :class:`Cache`
+    """
+
+    contents: ModuleContents
+    static: StaticObservation
+    cache: Any
+
+
 class EpisodicExtractor(BaseFeaturesExtractor):
     """
     An attention encoder and the part of the decoder before the action distribution, as an SB3 features extractor.
 
     In evaluation mode and without gradients it keeps the encodings of the last batch and encodes only rows whose static part
-    has changed: once per episode instead of once per step. Training mode, loading parameters and moving to another device
-    clear that cache; so must whoever changes parameters in another way (:meth:`clear_cache`).
+    has changed: once per episode instead of once per step. Encodings are used only while all parameters and buffers are what
+    they were, see :class:`~sb3_uav.policies.torch_state.ModuleContents`, and never while torch traces or exports the network.
+    After a change of the computation itself (a hook, another activation function) call :meth:`clear_cache`.
 
     With gradients it encodes every instance of a minibatch once, however many transitions it has there. An episode rollout
     buffer says which transitions belong together (key ``episode_index``, int64, beside static parts that stand once per
@@ -106,7 +122,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         self.use_cache = True
         self.share_encodings = True
         self.n_encoded_rows = 0
-        self._cached: tuple[StaticObservation, Any] | None = None
+        self._kept: _Kept | None = None
 
     @classmethod
     def n_actions(cls, observation_space: spaces.Space) -> int:
@@ -153,7 +169,8 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         :param static: ``batch`` instances
         :return: Their encodings, the level's :class:`Cache`
         """
-        self.n_encoded_rows += len(static.depot)
+        if not is_recorded():
+            self.n_encoded_rows += len(static.depot)
         return self.precompute(self.encoder(static), static)
 
     def forward(self, observations: TensorDict) -> th.Tensor:
@@ -165,7 +182,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         static = StaticObservation.from_observation(observations)
         dynamic = {key: value for key, value in observations.items() if key not in STATIC_KEYS}
         index = dynamic.pop(EPISODE_INDEX, None)
-        if index is None and th.is_grad_enabled() and self.share_encodings:
+        if index is None and th.is_grad_enabled() and self.share_encodings and not is_recorded():
             static, index = static.unique()
         if index is None:
             return self._decode_each(self._encode_cached(static), dynamic)
@@ -182,25 +199,25 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         return self.decode(cache, state)[:, 0]
 
     def _encode_cached(self, static: StaticObservation) -> Cache:
-        if self.training or th.is_grad_enabled() or not self.use_cache:
+        if self.training or th.is_grad_enabled() or not self.use_cache or is_recorded():
             return self.encode(static)
-        if self._cached is None or self._cached[0].tasks.shape != static.tasks.shape:
-            rows, cache = None, self.encode(static)
+        contents, kept = ModuleContents(self), self._kept
+        if kept is None or kept.contents != contents or kept.static.tasks.shape != static.tasks.shape:
+            cache = self.encode(static)
         else:
-            known, cache = self._cached
-            rows = known.changed_rows(static)
+            rows, cache = kept.static.changed_rows(static), kept.cache
+            if len(rows) == 0:
+                return cache
             if len(rows) == len(static.depot):
                 cache = self.encode(static)
-            elif len(rows) > 0:
+            else:
                 cache = cache.update_rows(rows, self.encode(static.rows(rows)))
-        if rows is None or len(rows) > 0:
-            # A copy, because an environment may write its next observation into the same memory.
-            self._cached = (static.clone(), cache)
+        self._kept = _Kept(contents, static.clone(), cache)
         return cache
 
     def clear_cache(self) -> None:
         """Forget the kept encodings."""
-        self._cached = None
+        self._kept = None
 
     def train(self, mode: bool = True) -> EpisodicExtractor:
         if mode:
@@ -211,9 +228,5 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         self.clear_cache()
         return super()._apply(*args, **kwargs)
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        self.clear_cache()
-        super()._load_from_state_dict(*args, **kwargs)
-
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cached": None}
+        return {**self.__dict__, "_kept": None}

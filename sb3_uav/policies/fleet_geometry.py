@@ -1,8 +1,8 @@
-"""Measures of how a task fits to the UAVs of a fleet, as inputs of the allocator."""
+"""Measures of how a task fits the UAVs of a fleet, as inputs of the allocator."""
 
 from __future__ import annotations
 
-from enum import IntEnum, auto
+from enum import IntEnum
 from typing import NamedTuple
 
 import torch as th
@@ -21,37 +21,29 @@ from sb3_uav.policies.static_observation import StaticObservation
 
 # How many of the nearest earlier tasks count as the neighbors of a task.
 N_NEIGHBORS = 8
-# From which part of its share of the tasks on a UAV counts as full.
+# Fraction of its share of the tasks from which a UAV counts as full.
 FULL = 0.95
 # Logarithm of about 20, a common number of tasks per UAV.
 LOG_TASKS_PER_UAV_OFFSET = 3.0
 
 
-class FleetFeature(IntEnum):
-    """Features of a task and a UAV in the allocator. The weights in existing zips depend on this order."""
-
+# Features of a task and a UAV in the allocator. The weights in existing zips depend on this order.
+FleetFeature = IntEnum(
+    "FleetFeature",
     # Tasks that the UAV would have, in fair shares; what exceeds FULL of that; and whether it has none yet.
-    LOAD = 0
-    OVERLOAD = auto()
-    EMPTY = auto()
+    "LOAD OVERLOAD EMPTY "
     # Which part of the task's neighbors the UAV has; the distance to the nearest of them, relative to the nearest of any UAV.
-    VOTES = auto()
-    RELATIVE_DISTANCE = auto()
-    NEAREST = auto()
+    "VOTES RELATIVE_DISTANCE NEAREST "
     # Distances to the centroid of the UAV's tasks and to the last of them.
-    CENTROID = auto()
-    LAST = auto()
+    "CENTROID LAST "
     # Half the perimeter of the box around its tasks and the depot, and what the task adds to that.
-    PERIMETER = auto()
-    GROWTH = auto()
+    "PERIMETER GROWTH "
     # Cosine of the angle between task and centroid, seen from the depot.
-    TOWARDS = auto()
+    "TOWARDS "
     # The same for all UAVs: distance to the depot, progress, tasks per UAV, fleet size, and UAVs without tasks.
-    HOME = auto()
-    PROGRESS = auto()
-    TASKS_PER_UAV = auto()
-    FLEET_SIZE = auto()
-    N_EMPTY = auto()
+    "HOME PROGRESS TASKS_PER_UAV FLEET_SIZE N_EMPTY",
+    start=0,
+)
 
 
 class FleetState(NamedTuple):
@@ -72,7 +64,7 @@ class FleetState(NamedTuple):
 
 class FleetGeometry(NamedTuple):
     """
-    What the allocator needs to measure how a task fits to the UAVs.
+    Precomputed distances for the features of tasks and UAVs.
 
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param neighbors: ``(batch, n_tasks, n_neighbors)`` int64, the nearest tasks of a task among those before it
@@ -85,6 +77,11 @@ class FleetGeometry(NamedTuple):
     neighbor_distance: th.Tensor
     n_real: th.Tensor
 
+    @property
+    def tasks(self) -> th.Tensor:
+        """``(batch, n_tasks, 2)``."""
+        return self.coordinates[:, 1:]
+
     @classmethod
     def of(cls, static: StaticObservation) -> FleetGeometry:
         """:param static: ``batch`` instances"""
@@ -94,11 +91,6 @@ class FleetGeometry(NamedTuple):
         distance = task_distances(coordinates, static.task_mask).masked_fill(later, 2 * FARTHEST)
         near, neighbors = distance.topk(min(N_NEIGHBORS, n_tasks), largest=False)
         return cls(coordinates, neighbors, near, static.task_mask.sum(1, keepdim=True).clamp(min=1).float())
-
-    @property
-    def tasks(self) -> th.Tensor:
-        """``(batch, n_tasks, 2)``."""
-        return self.coordinates[:, 1:]
 
     def initial(self, n_samples: int, n_uavs: int) -> FleetState:
         """
@@ -114,7 +106,7 @@ class FleetGeometry(NamedTuple):
         """
         :param fleet: The fleet before
         :param task: Index of a task
-        :param mine: ``(batch, n_samples, n_uavs)`` bool, whose it becomes
+        :param mine: ``(batch, n_samples, n_uavs)`` bool, True for the UAV that gets it
         :return: The fleet with it
         """
         point = self.tasks[:, None, None, task]
@@ -128,7 +120,7 @@ class FleetGeometry(NamedTuple):
 
     def of_prefixes(self, mine: th.Tensor) -> FleetState:
         """
-        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, True where the task belongs to the UAV
         :return: The fleets before each task and after the last, ``(batch, n_samples, n_tasks + 1, n_uavs, ...)``
         """
         # What the node before each task adds; the depot adds nothing.
@@ -146,7 +138,8 @@ class FleetGeometry(NamedTuple):
 
     def of_assignment(self, mine: th.Tensor) -> FleetState:
         """
-        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, whose task each is; of nobody if it has no UAV yet
+        :param mine: ``(batch, n_samples, n_tasks, n_uavs)`` bool, True where the task belongs to the UAV,
+            which may be none
         :return: The fleet with these tasks
         """
         points = self.tasks[:, None, :, None]
@@ -193,7 +186,8 @@ class FleetGeometry(NamedTuple):
         distance = self.neighbor_distance.gather(1, index)[:, :, None]
         theirs = (owners[:, :, None] == uavs) & (distance < FARTHEST)
         nearest = th.where(theirs, distance, FARTHEST).amin(-1)
-        votes = theirs.sum(-1) / theirs.any(2).sum(-1, keepdim=True).clamp(min=1)
+        # Integers divided by integers would have torch's default dtype.
+        votes = theirs.sum(-1).to(nearest.dtype) / theirs.any(2).sum(-1, keepdim=True).clamp(min=1)
 
         per_task = n_uavs / self.n_real[..., None]
         load = (fleet.n_tasks + 1) * per_task

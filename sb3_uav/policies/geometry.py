@@ -1,14 +1,14 @@
 """
-Distances and their kin as inputs of the networks, which then need not learn them, in units of the maximum flight distance.
+Distances and related measures as inputs of the networks, in units of the maximum flight distance.
 
-In these units one network serves every maximum flight distance, and a task that can be reached lies within 0.5 of the depot.
+In these units one network works for every maximum flight distance, and reachable tasks lie within 0.5 of the depot.
 Factors and offsets bring each feature to a magnitude of about 1 where D = 2 on the unit square, the paper's distribution.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import IntEnum, auto
+from enum import IntEnum
 from typing import TypeVar
 
 import torch as th
@@ -33,17 +33,12 @@ LOG_DENSITY_OFFSET = 3.0
 LOG_RATIO_LIMIT = 5.0
 
 
-class NodeFeature(IntEnum):
-    """Features of a task in the encoder. The weights in existing zips depend on this order."""
-
-    X = 0
-    Y = auto()
-    HOME = auto()
-    HOME_SQUARED = auto()
-    DIRECTION_X = auto()
-    DIRECTION_Y = auto()
-    NEAREST = auto()
-    DENSITY = auto()
+# Features of a task in the encoder. The weights in existing zips depend on this order.
+NodeFeature = IntEnum(
+    "NodeFeature",
+    "X Y HOME HOME_SQUARED DIRECTION_X DIRECTION_Y NEAREST DENSITY",
+    start=0,
+)
 
 
 FeatureT = TypeVar("FeatureT", bound=IntEnum)
@@ -77,8 +72,8 @@ def task_distances(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     """
     tasks = coordinates[:, 1:]
     distance = euclidean(tasks[:, :, None], tasks[:, None]).clamp(max=FARTHEST)
-    distance = distance.masked_fill(~task_mask[:, None], FARTHEST)
-    return distance.diagonal_scatter(distance.new_full(task_mask.shape, FARTHEST), dim1=1, dim2=2)
+    itself = th.eye(task_mask.shape[1], dtype=th.bool, device=task_mask.device)
+    return distance.masked_fill(~task_mask[:, None] | itself, FARTHEST)
 
 
 def smallest(distance: th.Tensor, n_smallest: int) -> th.Tensor:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch as th
 
-# Key under which an episode rollout buffer says to which row of the static part every transition belongs.
+# Key of an episode rollout buffer's samples: the row of the static part that each transition belongs to.
 EPISODE_INDEX = "episode_index"
 
 

@@ -26,7 +26,7 @@ SIGNATURES: dict[str, type[EpisodicPolicy]] = {
     "features_extractor.scorer.project_uav.weight": AllocatorPolicy,
     "features_extractor.project_graph.weight": RouterPolicy,
 }
-# Stock A2C puts its optimizer class, which JSON cannot hold, into policy_kwargs; acting needs no optimizer.
+# Stock A2C adds its optimizer class, which JSON cannot hold, to policy_kwargs; acting needs no optimizer.
 IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
 
 
@@ -49,11 +49,11 @@ def load_policy(
 
     :param path: The zip; ``.zip`` is appended if there is no such file, as SB3 does
     :param device: Device on which the policy should run
-    :param expected: The class that it must be; any of ours when None
+    :param expected: The class that the policy must have; any of ours when None
     :return: The policy, in evaluation mode
     :raises FileNotFoundError: If there is no such file
     :raises ValueError: If the file is damaged, is not the zip of one of our policies or of another one than expected, or
-        holds numbers that are not finite; the message names the file and what to do
+        holds numbers that are not finite; the message names the file and the remedy
     """
     file = _existing_file(Path(path))
     data, parameters = _read_zip(file)
@@ -90,8 +90,8 @@ def load_policy(
 
 def _existing_file(path: Path) -> Path:
     """
-    :param path: What the user gave
-    :return: The file that is meant
+    :param path: Path with or without ``.zip``
+    :return: The existing file
     :raises FileNotFoundError: If there is none
     """
     for candidate in (path, path.with_name(path.name + ".zip")):
@@ -103,8 +103,8 @@ def _existing_file(path: Path) -> Path:
 def _read_zip(file: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
     :param file: An SB3 zip
-    :return: The attributes of the algorithm as they stand in its JSON, and the state dict of its policy on the CPU
-    :raises ValueError: If it is not one
+    :return: The attributes of the algorithm as its JSON holds them, and the state dict of its policy on the CPU
+    :raises ValueError: If the file is not one
     """
     try:
         with zipfile.ZipFile(file) as archive:
@@ -139,9 +139,9 @@ def _read_zip(file: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
 def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
     """
     :param data: The JSON of an SB3 zip
-    :param file: Where it stands, named in errors
+    :param file: The zip, named in errors
     :return: ``policy_kwargs`` without those for the optimizer
-    :raises ValueError: If some of them were not plain data, and so stand there as a pickle
+    :raises ValueError: If some of them are not plain data and are therefore stored as a pickle
     """
     stored = data.get("policy_kwargs", {})
     if not isinstance(stored, dict):

@@ -1,25 +1,25 @@
-"""How many instances fit into the memory at once."""
+"""The number of instances that fit into memory at once."""
 
 from __future__ import annotations
 
 import torch as th
 
-# What one pass may take on a CPU, in bytes. More is not faster there.
+# Memory of one pass on a CPU, in bytes. More is not faster there.
 CPU_MEMORY = 2**30
-# What encoder and decoder take per node: about 1,000 float32 in a default network, four times.
+# Bytes per node in encoder and decoder: about 1,000 float32 in a default network, four times.
 NODE_MEMORY = 2**14
-# What the distances between all tasks take per pair of nodes: coordinates' differences, and some copies in float32.
+# Bytes per pair of nodes for the distances between all tasks: differences of coordinates, and copies in float32.
 PAIR_MEMORY = 24
-# What splitting takes per task, sample and UAV: coordinates and indices in float64 and int64, and their copies.
+# Bytes per task, sample and UAV for splitting: coordinates and indices in float64 and int64, and their copies.
 SPLIT_MEMORY = 48
 
 
 def rows_that_fit(device: th.device, n_nodes: int, n_subsets: int = 0) -> int:
     """
-    :param device: Where they are encoded
+    :param device: Device of the network
     :param n_nodes: Nodes of each instance, the depot included
-    :param n_subsets: Into how many subsets each is going to be split at once
-    :return: How many instances can be treated at once, at least 1
+    :param n_subsets: Number of subsets into which each instance is split at once
+    :return: Number of instances that can be processed at once, at least 1
     """
     memory = CPU_MEMORY
     if device.type == "cuda":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum, auto
+from enum import IntEnum
 from typing import NamedTuple
 
 import torch as th
@@ -32,36 +32,29 @@ FARTHEST_NEXT = 0.25
 LOG_COUNT_SCALE = 3
 
 
-class MoveFeature(IntEnum):
-    """Features of a move in the router. The weights in existing zips depend on this order."""
-
+# Features of a move in the router. The weights in existing zips depend on this order.
+MoveFeature = IntEnum(
+    "MoveFeature",
     # Length of the move, and logarithm of its ratio to that of the nearest feasible node.
-    DISTANCE = 0
-    RELATIVE_DISTANCE = auto()
+    "DISTANCE RELATIVE_DISTANCE "
     # From there to the depot, distance left after flying there and home, and what the move adds to the way home.
-    HOME = auto()
-    SLACK = auto()
-    DETOUR = auto()
+    "HOME SLACK DETOUR "
     # The same for every move: distance left, and distance from here to the depot.
-    REMAINING = auto()
-    HOME_HERE = auto()
+    "REMAINING HOME_HERE "
     # Tasks that can still be visited after the move: distance from there to the nearest, logarithm of its ratio to the
     # length of the move, mean distance of the N_CLUSTER nearest, and which part of the N_FEW and of the N_NEXT nearest tasks.
-    ONWARD = auto()
-    RELATIVE_ONWARD = auto()
-    CLUSTER = auto()
-    OPEN_FEW = auto()
-    OPEN_MANY = auto()
+    "ONWARD RELATIVE_ONWARD CLUSTER OPEN_FEW OPEN_MANY "
     # How many tasks can be visited now, and which part of them lies on the same side of the line from the depot to here.
-    N_FEASIBLE = auto()
-    ON_SIDE = auto()
+    "N_FEASIBLE ON_SIDE "
     # Cosine of the angle between here and there, seen from the depot.
-    ANGLE = auto()
+    "ANGLE",
+    start=0,
+)
 
 
 class MoveGeometry(NamedTuple):
     """
-    What the router needs to measure a UAV's next moves.
+    Precomputed distances for the features of a UAV's next moves.
 
     :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
     :param home: ``(batch, n_tasks + 1)``, distance to the depot
@@ -88,8 +81,8 @@ class MoveGeometry(NamedTuple):
 
     def features(self, position: th.Tensor, remaining: th.Tensor, action_mask: th.Tensor) -> th.Tensor:
         """
-        :param position: ``(batch, n_samples)`` int64, the node where the UAV is
-        :param remaining: ``(batch, n_samples)``, what it can still fly, in units of the maximum
+        :param position: ``(batch, n_samples)`` int64, the UAV's current node
+        :param remaining: ``(batch, n_samples)``, remaining flight distance, in units of the maximum
         :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
         :return: ``(batch, n_samples, n_tasks + 1, len(MoveFeature))``
         """

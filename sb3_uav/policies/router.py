@@ -21,13 +21,14 @@ from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.torch_state import float32_on_cpu
 
-# Logits are clipped to +-10 (paper, equation of u; Bello et al.).
+# Compatibilities are clipped to +-10 (C in the paper's equation (22), after Bello et al.).
 LOGIT_CLIP = 10.0
 # What the compatibilities get from the geometry of a move before training: twice as far away is 2^4 times less likely. Tours
 # then begin as those of a randomized nearest neighbor search.
 INITIAL_SCORE = {MoveFeature.RELATIVE_DISTANCE: -4.0}
-# Into how many chunks by size subsets are cut before they are padded.
+# Number of chunks, by size, into which subsets are split before they are padded.
 SIZE_CLASSES = 2
 
 
@@ -55,8 +56,8 @@ class RouterCache(Cache):
 
 class RouterState(NamedTuple):
     """
-    :param position: ``(batch, n_samples)`` int64, the node where the UAV is
-    :param remaining_distance: ``(batch, n_samples)`` float32, what it can still fly
+    :param position: ``(batch, n_samples)`` int64, the UAV's current node
+    :param remaining_distance: ``(batch, n_samples)`` float32, remaining flight distance
     :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
     """
 
@@ -67,13 +68,13 @@ class RouterState(NamedTuple):
 
 class MoveBias(nn.Module):
     """
-    What the geometry of a move, together with the embeddings, adds to its scores.
+    The share of a move's scores that depends on its geometry, together with the embeddings.
 
     The last score is that of the compatibilities. It starts as a preference for near tasks, see :data:`INITIAL_SCORE`.
 
     :param embed_dim: Size of the embeddings
     :param bias_dim: Hidden size
-    :param n_scores: How many scores a move has
+    :param n_scores: Number of scores of a move
     :param mixed_precision: Whether the hidden layer computes in bfloat16: a third to a quarter of the time on CPUs with AMX
     """
 
@@ -95,10 +96,10 @@ class MoveBias(nn.Module):
         """
         :param features: ``(batch, n_samples, n_nodes, len(MoveFeature))``
         :param nodes: ``(batch, n_nodes, bias_dim)``, the projected nodes
-        :param query: ``(batch, n_samples, embed_dim)``, where the UAV is and what it can still fly
+        :param query: ``(batch, n_samples, embed_dim)``, from the current node and the remaining distance
         :return: ``(batch, n_samples, n_nodes, n_scores)``
         """
-        # The direct part tells near tasks apart and stays exact.
+        # The direct part distinguishes near tasks and stays exact.
         direct = self.linear(features)
         with th.autocast(features.device.type, th.bfloat16, enabled=self.mixed_precision):
             features = self.project_features(features)
@@ -108,19 +109,18 @@ class MoveBias(nn.Module):
 
 class RouterExtractor(EpisodicExtractor):
     """
-    Features = [clipped compatibilities of the depot and of every task, glimpse] (paper, section IV-B).
+    Features = [clipped compatibilities of the depot and of every task, glimpse] (paper, equations (20) to (22)).
 
-    The compatibilities are the logits of :class:`RouterPolicy`; other policies may build on the features as they like.
+    The compatibilities are the logits of :class:`RouterPolicy`; other policies may use the features in any way.
 
     :param observation_space: Observation space of a ``RoutePlanning`` environment
-    :param settings: Fields of :class:`~sb3_uav.policies.settings.NetworkSettings`
-    :raises TypeError: If there is no such setting
-    :raises ValueError: If a setting or the observation space is not allowed
+    :param settings: As for :class:`~sb3_uav.policies.allocator.AllocatorExtractor`, with the same errors
     """
 
     environment = "RoutePlanning"
     own_key = "position"
 
+    @float32_on_cpu()
     def __init__(self, observation_space: spaces.Space, **settings: Any) -> None:
         network = NetworkSettings.of(settings)
         embed_dim, n_heads = network.embed_dim, network.n_heads
@@ -180,7 +180,7 @@ class RouterPolicy(EpisodicPolicy):
     """
     The lower level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments.
 
-    The number of tasks is free.
+    It takes any number of tasks.
     ``net_arch`` shapes the critic only, because the actor's logits are the extractor's compatibilities.
     """
 
@@ -234,9 +234,9 @@ class RouterPolicy(EpisodicPolicy):
         Rows are taken in order of size, so that small subsets are not padded to the largest.
 
         :param instances: ``batch`` single-UAV instances, on any device
-        :param max_rows: How many rows to decode at once; as many as memory allows when None
-        :param n_tours: How many tours to try for each: the greedy one and samples, of which the best is kept
-        :param generator: Source of randomness of the samples, on the policy's device
+        :param max_rows: Number of rows to decode at once; as many as memory allows when None
+        :param n_tours: Number of tours to try for each row, the greedy one and samples; the best is kept
+        :param generator: Source of randomness for sampling, on the policy's device
         :return: ``(batch, n_steps)`` int64 node indices padded with the depot, on the device of the instances
         """
         self.set_training_mode(False)
@@ -257,7 +257,7 @@ class RouterPolicy(EpisodicPolicy):
     def _best_tours(self, instances: Instances, n_tours: int, generator: th.Generator | None) -> th.Tensor:
         """
         :param instances: ``batch`` instances on the policy's device
-        :param n_tours: How many tours to try for each
+        :param n_tours: Number of tours to try for each
         :param generator: Source of randomness
         :return: ``(batch, n_steps)``
         """

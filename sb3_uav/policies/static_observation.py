@@ -32,7 +32,7 @@ class StaticObservation(NamedTuple):
         """:param observation: A batch of preprocessed observations"""
         return cls(
             depot=observation["depot"],
-            tasks=observation["tasks"].view(len(observation["tasks"]), -1, 2),
+            tasks=observation["tasks"].unflatten(1, (-1, 2)),
             values=observation["task_values"],
             task_mask=observation["task_mask"].bool(),
             max_distance=observation["max_distance"],
@@ -41,6 +41,7 @@ class StaticObservation(NamedTuple):
     @classmethod
     def from_instances(cls, instances: Instances) -> StaticObservation:
         """:param instances: Instances on the network's device"""
+        instances = instances.near_origin()
         return cls(
             depot=instances.depot.float(),
             tasks=instances.tasks.float(),

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+__all__ = ["files", "names", "pair_files"]
+
 DEFAULT_PAIR = "universal"
 ALLOCATOR_FILE, ROUTER_FILE = "allocator.zip", "router.zip"
 
@@ -19,7 +21,7 @@ def names() -> list[str]:
 
 def files(name: str = DEFAULT_PAIR) -> tuple[Path, Path]:
     """
-    :param name: Of a pair
+    :param name: Name of a pair
     :return: The zips of its allocator and of its router
     :raises ValueError: If there is no such pair
     """

@@ -1,4 +1,4 @@
-"""What an action is worth beyond the baseline."""
+"""Advantages: returns minus a baseline."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_uav.reinforce.baselines import Baseline
 
-# Keeps equal advantages from being divided by 0, as in SB3.
+# Prevents a division by zero if all advantages are equal, as in SB3.
 EPSILON = 1e-8
 
 
 def scale_advantages(advantages: th.Tensor) -> th.Tensor:
     """
     :param advantages: Advantages of any shape
-    :return: The same divided by their standard deviation; a single one, which has none, unchanged
+    :return: The advantages divided by their standard deviation; a single advantage is returned unchanged
     """
     return advantages / (advantages.std() + EPSILON) if advantages.numel() > 1 else advantages
 
@@ -23,7 +23,7 @@ def scale_advantages(advantages: th.Tensor) -> th.Tensor:
 def complete_steps(buffer: RolloutBuffer, last_episode_starts: np.ndarray) -> np.ndarray:
     """
     :param buffer: A full buffer of SB3's loop
-    :param last_episode_starts: ``(n_envs,)``, whether an episode ended with the buffer's last step
+    :param last_episode_starts: ``(n_envs,)``, whether an episode ended at the last step of the buffer
     :return: ``(n_steps, n_envs)`` bool, True at steps of episodes that end within the buffer
     """
     ended_after = np.vstack([buffer.episode_starts[1:], last_episode_starts]).astype(bool)
@@ -33,10 +33,10 @@ def complete_steps(buffer: RolloutBuffer, last_episode_starts: np.ndarray) -> np
 def step_advantages(buffer: RolloutBuffer, complete: np.ndarray, baseline: Baseline, normalize: bool) -> np.ndarray:
     """
     :param buffer: A full buffer of SB3's loop
-    :param complete: ``(n_steps, n_envs)`` bool, steps to learn from
-    :param baseline: What to subtract from the returns
-    :param normalize: Whether to give the advantages mean 0 and standard deviation 1
-    :return: ``(n_steps, n_envs)`` return minus baseline, 0 at steps not to learn from
+    :param complete: ``(n_steps, n_envs)`` bool, the steps to train on
+    :param baseline: The baseline to subtract from the returns
+    :param normalize: Whether to normalize the advantages to mean 0 and standard deviation 1
+    :return: ``(n_steps, n_envs)``, return minus baseline at the steps to train on, 0 elsewhere
     """
     advantages = np.zeros_like(buffer.advantages)
     if complete.any():
@@ -44,6 +44,6 @@ def step_advantages(buffer: RolloutBuffer, complete: np.ndarray, baseline: Basel
         gain = (returns - baseline.of_steps(returns, buffer.values))[complete]
         if normalize:
             gain = (gain - gain.mean()) / (gain.std() + EPSILON)
-        # The mean over the buffer becomes the mean over the steps to learn from.
+        # Scaled so that the mean over the buffer equals the mean over the steps to train on.
         advantages[complete] = gain * (complete.size / complete.sum())
     return advantages

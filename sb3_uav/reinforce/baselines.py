@@ -1,4 +1,4 @@
-"""What REINFORCE subtracts from the return."""
+"""Baselines that REINFORCE subtracts from returns."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from sb3_uav.common.statistics import significantly_positive
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 
-# How many test instances are decoded at once: the smaller of the paper's batches.
+# Number of test instances decoded at once: the smaller of the paper's batch sizes.
 TEST_ROWS = 256
 
 
 class Learner(Protocol):
     """
-    What baselines use of the algorithm that they belong to.
+    The part of an algorithm that its baseline uses.
 
     :param policy: The policy that learns
     :param baseline_policy: A copy of it for greedy episodes, if the baseline needs one
-    :param baseline_state: What a baseline keeps between runs, plain data
+    :param baseline_state: Plain data that the baseline keeps between runs
     :param epoch: Number of complete epochs
     :param stream_seed: Seed of the random streams
     :param device: Device of the policy
@@ -51,13 +51,12 @@ class Baseline(ABC):
     """
     A baseline of returns.
 
-    Whatever it must remember between runs it keeps in ``model.baseline_state`` (plain data) or in a module that the model
-    saves.
+    State that must survive between runs is kept in ``model.baseline_state`` (plain data) or in a module that the model saves.
 
     :param model: The algorithm, usually :class:`~sb3_uav.reinforce.REINFORCE`
     """
 
-    # Whether whole episodes on known instances are needed, which only the fused driver has.
+    # Whether the baseline needs whole episodes on known instances, which only the fused driver provides.
     needs_episodes = False
 
     def __init__(self, model: Learner) -> None:
@@ -66,31 +65,32 @@ class Baseline(ABC):
     @abstractmethod
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
         """
-        :param problem: What is being learned
+        :param problem: The problem being learned
         :param instances: ``batch`` instances on the device of the policy
         :param returns: ``(batch, n_samples)`` float64
-        :return: Broadcastable against ``returns``
+        :return: Baseline values, float64, broadcastable against ``returns``
         """
 
     def of_steps(self, returns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """
         :param returns: ``(n_steps, n_envs)``, discounted rewards to go of complete episodes, NaN elsewhere
         :param values: ``(n_steps, n_envs)``, the critic's estimates
-        :return: Broadcastable against ``returns``
+        :return: Baseline values, broadcastable against ``returns``
+        :raises ValueError: If the baseline needs whole episodes
         """
         raise ValueError(f"{type(self).__name__} needs whole episodes.")
 
     def end_epoch(self, problem: Problem) -> None:
         """
-        Called after the last update of every epoch; most baselines have nothing to do then.
+        Called after the last update of an epoch; if an update completes several epochs, once, for the last of them.
 
-        :param problem: What is being learned
+        :param problem: The problem being learned
         """
         return
 
 
 class NoBaseline(Baseline):
-    """The plain return."""
+    """No baseline: the advantage is the return."""
 
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
         return th.zeros_like(returns[:1, :1])
@@ -101,10 +101,10 @@ class NoBaseline(Baseline):
 
 class ExponentialBaseline(Baseline):
     """
-    Exponential moving average of the mean return, the present batch included (Kool et al., appendix).
+    Exponential moving average of the mean return, including the current batch (Kool et al., appendix).
 
     :param model: The algorithm
-    :param beta: Weight of the past
+    :param beta: Weight of the previous average
     """
 
     def __init__(self, model: Learner, beta: float = 0.8) -> None:
@@ -137,7 +137,7 @@ class SharedBaseline(Baseline):
 
 
 class CriticBaseline(Baseline):
-    """The policy's value network, trained beside it; subtracted step by step from the rewards to go."""
+    """The policy's value network, trained with the policy and subtracted from the rewards to go at each step."""
 
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
         return th.zeros_like(returns[:1, :1])
@@ -150,14 +150,14 @@ class RolloutBaseline(Baseline):
     """
     Greedy episodes of a copy of the policy (paper, section IV-C; Kool et al.).
 
-    During the first epoch an exponential average stands in. After every epoch the copy is replaced if the policy is
-    significantly better on fresh instances that training never sees. Both are evaluated there anew each time, so the
-    comparison always uses the current router.
+    An exponential moving average replaces it during the first epochs. After each epoch, the copy is replaced if the policy is
+    significantly better on fresh instances that are not used in training. Both are evaluated on these instances after each
+    epoch, so the comparison always uses the current router.
 
     :param model: The algorithm
-    :param warmup_epochs: Epochs of the exponential baseline
-    :param beta: Its weight of the past
-    :param n_test_instances: Instances of the test
+    :param warmup_epochs: Number of epochs with the exponential moving average
+    :param beta: Weight of the previous average in the exponential moving average
+    :param n_test_instances: Number of instances for the t-test
     :param alpha: Significance level of the one-sided paired t-test
     """
 
@@ -194,7 +194,7 @@ class RolloutBaseline(Baseline):
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
         instances = copy.arrange(instances)
         gains = []
-        for rows in th.arange(len(instances)).split(TEST_ROWS):
+        for rows in th.arange(len(instances), device=instances.device).split(TEST_ROWS):
             part = instances[rows].to(self.model.device)
             gains.append((greedy_returns(policy, problem, part) - greedy_returns(copy, problem, part)).cpu())
         gain = th.cat(gains).flatten().numpy()
@@ -208,9 +208,9 @@ class RolloutBaseline(Baseline):
 def greedy_returns(policy: Any, problem: Problem, instances: Instances) -> th.Tensor:
     """
     :param policy: An ``EpisodicPolicy``
-    :param problem: What it plays
-    :param instances: ``batch`` instances on its device
-    :return: Returns of its greedy episodes, ``(batch, 1)`` float64
+    :param problem: The problem to play
+    :param instances: ``batch`` instances on the device of the policy
+    :return: ``(batch, 1)`` float64, returns of the policy's greedy episodes
     """
     was_training = policy.training
     policy.set_training_mode(False)

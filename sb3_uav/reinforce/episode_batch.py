@@ -1,8 +1,7 @@
-"""Episodes that the fused driver has played, and how they look to code that expects SB3's step loop."""
+"""Episodes played by the fused driver, and their conversion to the steps that SB3's callbacks expect."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -16,13 +15,13 @@ from sb3_uav.policies.extractor import Cache
 
 class EpisodeBatch(NamedTuple):
     """
-    Complete episodes waiting for the gradient pass.
+    Complete episodes on which the next update is computed.
 
     :param instances: ``batch`` instances
-    :param cache: Their encodings, with gradients
+    :param cache: The encodings of the instances, with gradients
     :param actions: ``(batch, n_samples, n_steps)`` int64
     :param returns: ``(batch, n_samples)`` float64
-    :param baseline: Broadcastable against ``returns``
+    :param baseline: Baseline values, float64, broadcastable against ``returns``
     """
 
     instances: Instances
@@ -34,7 +33,7 @@ class EpisodeBatch(NamedTuple):
     def rewards_to_go(self, problem: Problem) -> th.Tensor:
         """
         :param problem: The problem that was played
-        :return: ``(batch, n_samples, n_steps)`` float32, the sum of the rewards of each step and of those after it
+        :return: ``(batch, n_samples, n_steps)`` float32, the sum of the rewards from each step to the end of the episode
         """
         collected = problem.step_rewards(self.instances, self.actions, self.returns)
         return collected.flip(-1).cumsum(-1).flip(-1).float()
@@ -45,7 +44,7 @@ class Step(NamedTuple):
     One step of ``batch`` environments in the form of a ``VecEnv``.
 
     :param rewards: ``(batch,)`` float32
-    :param dones: ``(batch,)`` bool, all alike
+    :param dones: ``(batch,)`` bool, all equal
     :param infos: Statistics of the episodes that end here, one dictionary per environment
     """
 
@@ -54,19 +53,20 @@ class Step(NamedTuple):
     infos: list[dict[str, Any]]
 
 
-def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_envs: int) -> Iterator[Step]:
+def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_steps: int) -> Iterator[Step]:
     """
-    Spread the episodes of a batch over as many steps as SB3's loop would have taken, ``n_envs`` environment steps each.
+    Distribute played episodes over the steps of a ``VecEnv``.
 
-    :param returns: ``(batch, n_samples)``
-    :param lengths: ``(batch, n_samples)``, environment steps
-    :param n_envs: Number of environments
-    :return: The steps, sample by sample; all episodes of a sample end in its last one
+    :param returns: ``(batch,)``, episode returns
+    :param lengths: ``(batch,)``, episode lengths in environment steps
+    :param n_steps: Number of ``VecEnv`` steps, at least 1
+    :return: The steps; all episodes end in the last one
     """
-    for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
-        batch = len(sample_returns)
-        for _ in range(math.ceil(sample_lengths.sum() / n_envs) - 1):
-            yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
-        ended = zip(sample_returns.tolist(), sample_lengths.tolist(), strict=True)
-        infos = [{"episode": {"r": episode_return, "l": length}} for episode_return, length in ended]
-        yield Step(sample_returns.astype(np.float32), np.ones(batch, bool), infos)
+    batch = len(returns)
+    for _ in range(n_steps - 1):
+        yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
+    infos = [
+        {"objective": episode_return, "illegal_actions": 0, "episode": {"r": episode_return, "l": length}}
+        for episode_return, length in zip(returns.tolist(), lengths.tolist(), strict=True)
+    ]
+    yield Step(returns.astype(np.float32), np.ones(batch, bool), infos)

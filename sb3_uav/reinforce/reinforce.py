@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import pathlib
 from collections.abc import Iterable
 from copy import deepcopy
@@ -30,19 +31,21 @@ from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
+from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, steps_of_episodes
+from sb3_uav.reinforce.finite import require_finite
+from sb3_uav.reinforce.monitor_rows import log_episodes
 from sb3_uav.reinforce.recognition import find_problem
 
 SelfT = TypeVar("SelfT", bound="REINFORCE")
 
-# Larger than any run; learn_instances stops by instances, not by steps.
+# More steps than any run takes; learn_instances stops after a number of instances instead.
 NO_STEP_LIMIT = 2**62
-# Settings of SB3's on-policy algorithms that REINFORCE has no use for: rewards to go are not mixed with value estimates, and
-# actions are discrete.
+# Settings of SB3's on-policy algorithms that REINFORCE does not offer: returns are not mixed with value estimates, and actions
+# are discrete.
 NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
@@ -50,10 +53,13 @@ class REINFORCE(OnPolicyAlgorithm):
     """
     REINFORCE with a choice of baselines.
 
-    On our environments with our policies it plays whole episodes of ``n_envs`` instances at a time on the policy's device (the
-    fused driver): one encoding, ``n_samples`` episodes per instance, one gradient pass over all their steps, one update.
-    On any other environment it collects ``n_steps`` per env with SB3's loop and learns from the episodes completed in there;
-    the baselines ``shared`` and ``rollout``, which replay instances, are then not available.
+    With the policies and environments of this package, whole episodes of ``n_envs`` instances are played at a time on the
+    policy's device (the fused driver): one encoding, ``n_samples`` episodes per instance, one gradient pass over all their
+    steps, one update. With any other policy or environment, SB3's loop collects ``n_steps`` steps per environment, and the
+    episodes that are completed in them are used for training; the baselines ``shared`` and ``rollout``, which replay
+    instances, are then not available. Settings without effect are reported by a warning.
+
+    Training stops with a ``ValueError`` before an update whose loss or gradient is not finite.
 
     :param policy: The policy model to use (MlpPolicy, AllocatorPolicy, RouterPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -63,8 +69,9 @@ class REINFORCE(OnPolicyAlgorithm):
     :param baseline: ``"none"``, ``"exponential"``, ``"shared"`` (mean over the samples of an instance), ``"critic"`` or
         ``"rollout"`` (the paper's)
     :param baseline_kwargs: Arguments of the baseline, see :mod:`sb3_uav.reinforce.baselines`
-    :param instances_per_epoch: Instances per epoch; after each the rollout baseline is tested and the learning rate decays
-    :param lr_decay: Factor of the learning rate per epoch (fused driver)
+    :param instances_per_epoch: Instances per epoch (fused driver); after the update that completes it, the rollout baseline is
+        tested and the learning rate decays
+    :param lr_decay: Factor by which the learning rate is multiplied after each epoch (fused driver)
     :param gamma: Discount factor (SB3's loop; the fused driver does not discount)
     :param ent_coef: Entropy coefficient for the loss calculation
     :param vf_coef: Value function coefficient for the loss calculation (baseline ``critic``)
@@ -140,7 +147,7 @@ class REINFORCE(OnPolicyAlgorithm):
         self.instances_per_epoch = instances_per_epoch
         self.lr_decay = lr_decay
         self.normalize_advantage = normalize_advantage
-        # All that a resumed run needs to go on as if it had not been interrupted.
+        # State from which a resumed run continues as if it had not been interrupted.
         self.stream_seed = draw_seed() if seed is None else seed
         self.baseline_state: dict[str, Any] = {}
         self.baseline_policy: EpisodicPolicy | None = None
@@ -148,7 +155,9 @@ class REINFORCE(OnPolicyAlgorithm):
         self.n_instances = 0
         self.epoch = 0
         self._n_updates = 0
-        # Collecting stops there; set by learn_instances and by the ITS callback.
+        # Difference between num_timesteps, which grows by n_envs at a time, and the total length of the episodes played.
+        self.steps_ahead = 0
+        # Training stops at this number of instances; set by learn_instances and by the ITS callback.
         self.max_instances: int | None = None
         self._batch: EpisodeBatch | None = None
 
@@ -168,7 +177,7 @@ class REINFORCE(OnPolicyAlgorithm):
             raise ValueError("baseline 'shared' is the mean of several samples: set n_samples to at least 2.")
         n_steps = self.n_steps
         if issubclass(self.policy_class, EpisodicPolicy):
-            # The fused driver does not use SB3's buffer, so do not fill the memory with one.
+            # The fused driver does not use SB3's buffer, so do not allocate a large one.
             self.n_steps = 1
         super()._setup_model()
         self.n_steps = n_steps
@@ -186,29 +195,29 @@ class REINFORCE(OnPolicyAlgorithm):
             self.baseline_policy.requires_grad_(False)
             self.baseline_policy.set_training_mode(False)
         if self.baseline != "critic" and hasattr(self.policy, "value_net"):
-            # Never trained, and 0 everywhere, so that SB3's bootstrap of time limits adds nothing.
+            # It is never trained; with zero values, SB3's bootstrapping at time limits adds nothing.
             for parameter in self.policy.value_net.parameters():
                 th.nn.init.zeros_(parameter)
 
     def _refuse_baseline(self) -> None:
         raise ValueError(
-            f"baseline {self.baseline!r} replays instances, which needs a sb3_uav policy on a sb3_uav environment without "
-            "VecEnv wrappers that change rewards or observations; use 'none', 'exponential' or 'critic' here."
+            f"baseline {self.baseline!r} replays instances, which needs a sb3_uav policy on a sb3_uav environment, but "
+            f"{why_step_loop(self.policy_class, self.env)}; use 'none', 'exponential' or 'critic' here."
         )
 
     @property
     def problem(self) -> Problem | None:
-        """What the fused driver plays; None when policy or environment leave only SB3's step loop."""
+        """The problem that the fused driver plays; None if the policy or the environment requires SB3's step loop."""
         if not isinstance(self.policy, EpisodicPolicy) or self.env is None:
             return None
         return find_problem(self.env)
 
     def draw_batch(self, index: int) -> Instances:
         """
-        The training instances of one update; the same ones whenever asked.
+        The training instances of one update, the same at every call.
 
         :param index: Number of the update, from 0
-        :return: The instances on the CPU, ``n_envs`` unless the generator mixes sizes, their tasks as the policy wants them
+        :return: The instances on the CPU, tasks in the policy's preferred order; ``n_envs`` unless the generator mixes sizes
         """
         assert self.problem is not None and isinstance(self.policy, EpisodicPolicy)
         rng = random_stream(self.stream_seed, TRAINING_STREAM, index)
@@ -217,7 +226,7 @@ class REINFORCE(OnPolicyAlgorithm):
     def action_generator(self, counter: int) -> th.Generator:
         """
         :param counter: Number of the update, from 0
-        :return: The source of its sampled actions, on the device of the policy
+        :return: The random generator for sampling its actions, on the device of the policy
         """
         return torch_generator(random_stream(self.stream_seed, ACTION_STREAM, counter), self.device)
 
@@ -234,7 +243,7 @@ class REINFORCE(OnPolicyAlgorithm):
         if not super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps):
             return False
         if self.baseline == "critic":
-            # The critic bootstraps what lies behind the end of the buffer.
+            # The critic bootstraps the return beyond the end of the buffer.
             complete = np.ones_like(rollout_buffer.returns, dtype=bool)
         else:
             assert self._last_episode_starts is not None
@@ -250,8 +259,8 @@ class REINFORCE(OnPolicyAlgorithm):
         if self.max_instances is not None and self.n_instances >= self.max_instances:
             return False
         instances = self.draw_batch(self.n_batches).to(self.device)
-        # In training mode and with gradients: this encoding serves the gradient pass too, and batch normalization then acts
-        # and learns with the same statistics.
+        # In training mode and with gradients: the gradient pass uses this encoding too, so that batch normalization acts and
+        # learns with the same statistics.
         self.policy.set_training_mode(True)
         cache = self.policy.encode(instances)
         generator = self.action_generator(self.n_batches)
@@ -268,23 +277,25 @@ class REINFORCE(OnPolicyAlgorithm):
 
     def _report_episodes(self, env: VecEnv, callback: BaseCallback, returns: np.ndarray, lengths: np.ndarray) -> bool:
         """
-        Count the steps and call the callbacks as SB3's loop would have: once per ``n_envs`` steps.
+        Count the steps and call the callbacks as SB3's loop does, once per ``n_envs`` steps.
 
-        :param returns: ``(batch, n_samples)``
-        :param lengths: ``(batch, n_samples)``
-        :return: False if a callback wants to stop
+        :param returns: ``(batch, n_samples)``, episode returns
+        :param lengths: ``(batch, n_samples)``, episode lengths in steps
+        :return: False if a callback stops the training
         """
-        batched = env.unwrapped if isinstance(env.unwrapped, BatchedVecEnv) else None
-        # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
-        for rewards, dones, infos in steps_of_episodes(returns, lengths, self.n_envs):  # noqa: B007
-            if dones.all() and batched is not None:
-                batched.log_episode(batched.episode_info(infos[0]["episode"]["r"], infos[0]["episode"]["l"]))
-            self.num_timesteps += self.n_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            if dones.all():
-                self._update_info_buffer(infos, dones)
+        for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
+            n_played = int(sample_lengths.sum())
+            n_calls = max(math.ceil((n_played - self.steps_ahead) / self.n_envs), 1)
+            self.steps_ahead += n_calls * self.n_envs - n_played
+            # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
+            for rewards, dones, infos in steps_of_episodes(sample_returns, sample_lengths, n_calls):  # noqa: B007
+                self.num_timesteps += self.n_envs
+                if dones.all():
+                    log_episodes(env, infos)
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    return False
+            self._update_info_buffer(infos, dones)
         return True
 
     def train(self) -> None:
@@ -295,6 +306,7 @@ class REINFORCE(OnPolicyAlgorithm):
         self.policy.optimizer.zero_grad()
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        require_finite({"loss": loss, "gradient norm": grad_norm}, self._n_updates + 1, self.num_timesteps)
         self.policy.optimizer.step()
         self._n_updates += 1
         self.logger.record("train/loss", loss.item())
@@ -306,17 +318,21 @@ class REINFORCE(OnPolicyAlgorithm):
             self.n_batches += 1
             self.n_instances += self.n_envs if batch is None else len(batch.instances)
             self.logger.record("train/epoch", self.epoch)
-            if self.n_instances >= (self.epoch + 1) * self.instances_per_epoch:
+            complete = self.n_instances // self.instances_per_epoch
+            if complete > self.epoch:
+                # A batch may complete several epochs. The policy is the same at the end of each of them, so the baseline is
+                # updated once, as at the end of the last.
+                self.epoch = complete - 1
                 self._baseline.end_epoch(problem)
-                self.epoch += 1
+                self.epoch = complete
 
     def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
-        """mean((baseline - return) * sum of log-probabilities) (paper, equation of the loss gradient)."""
+        """mean((baseline - return) * sum of log-probabilities) (paper, equation (24))."""
         assert isinstance(self.policy, EpisodicPolicy) and self.problem is not None
         evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
         value_loss = None
         if self.baseline == "critic":
-            # Steps after the end of an episode belong to nobody.
+            # Actions after the end of an episode are padding.
             lengths = self.problem.lengths(batch.instances, batch.actions)
             real = th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
             to_go, values = batch.rewards_to_go(self.problem)[real], evaluation.values[real]
@@ -369,25 +385,28 @@ class REINFORCE(OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfT:
+        warn_of_ignored_settings(self)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def learn_instances(
         self: SelfT, n_instances: int, callback: MaybeCallback = None, log_interval: int = 1, tb_log_name: str = "REINFORCE"
     ) -> SelfT:
         """
-        Go on learning for a number of instances, whatever the number of steps they take (fused driver only).
+        Continue training for a number of instances, however many steps they take (fused driver only).
 
-        Learning rate schedules do not advance meanwhile, because the number of steps to come is not known; ``lr_decay`` does.
+        Learning rate schedules do not advance during the call, because the number of steps is not known in advance; the decay
+        by ``lr_decay`` does.
 
-        :param n_instances: How many more instances to learn from, rounded up to whole batches
-        :param callback: callback(s) called at every step
-        :param log_interval: Log the training every ``log_interval`` updates
-        :param tb_log_name: the name of the run for TensorBoard logging
-        :return: the trained model
-        :raises ValueError: If policy and environment leave only SB3's step loop
+        :param n_instances: Number of further instances to train on, rounded up to whole batches
+        :param callback: Callback(s) called at every step
+        :param log_interval: Number of updates between logs
+        :param tb_log_name: Name of the run for TensorBoard logging
+        :return: The trained model
+        :raises ValueError: If the policy or the environment requires SB3's step loop
         """
         if self.problem is None:
-            raise ValueError("learn_instances needs a sb3_uav policy on a sb3_uav environment; use learn here.")
+            reason = why_step_loop(self.policy_class, self.env)
+            raise ValueError(f"learn_instances needs whole episodes, but {reason}; use learn here.")
         self.max_instances = self.n_instances + n_instances
         try:
             is_new = self.num_timesteps == 0
@@ -397,7 +416,7 @@ class REINFORCE(OnPolicyAlgorithm):
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto") -> None:
         if isinstance(load_path_or_dict, dict):
-            # A model may go on with another baseline than it was saved with.
+            # Training may continue with another baseline than the one the model was saved with.
             parameters = dict(load_path_or_dict)
             if self.baseline != "rollout":
                 parameters.pop("baseline_policy", None)

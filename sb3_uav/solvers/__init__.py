@@ -1,11 +1,21 @@
 from typing import Any
 
-from sb3_uav.solvers.base import OneByOneSolver, Solution, Solver, SolverResult
+from sb3_uav.solvers.base import NoScheduleError, OneByOneSolver, Solution, Solver, SolverResult
 from sb3_uav.solvers.dl_drl import DLDRL
 from sb3_uav.solvers.kmeans_am import KMeansAM
 from sb3_uav.solvers.registry import SOLVERS, make_solver
 
-__all__ = ["DLDRL", "SOLVERS", "KMeansAM", "OneByOneSolver", "Solution", "Solver", "SolverResult", "make_solver"]
+__all__ = [
+    "DLDRL",
+    "SOLVERS",
+    "KMeansAM",
+    "NoScheduleError",
+    "OneByOneSolver",
+    "Solution",
+    "Solver",
+    "SolverResult",
+    "make_solver",
+]
 
 
 def __getattr__(name: str) -> Any:

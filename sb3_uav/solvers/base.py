@@ -5,25 +5,27 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
+from sb3_uav.solvers.counting_tasks import CountingTasks
 
 
 @dataclass(frozen=True)
 class SolverResult:
     """
-    What a solver found for one instance.
+    The result of a solver for one instance.
 
-    :param schedule: The schedule; nobody has checked it yet
-    :param seconds: Wall time of the instance: that of its batch, divided by the size of the batch
+    :param schedule: The schedule, not checked yet
+    :param seconds: Wall time of the instance: the time of its batch divided by the batch size
     :param batch_size: How many instances were solved at once
-    :param bound: A proven upper bound of the objective, where the solver knows one
+    :param bound: A proven upper bound of the objective, if the solver has one
     """
 
     schedule: Schedule
@@ -32,15 +34,32 @@ class SolverResult:
     bound: float | None = None
 
 
+class NoScheduleError(RuntimeError):
+    """
+    A solver ended without any schedule.
+
+    :param message: The reason
+    :param bound: A proven upper bound of the objective, if the solver has one
+    """
+
+    def __init__(self, message: str, bound: float | None = None) -> None:
+        super().__init__(message)
+        self.bound = bound
+
+    def __reduce__(self) -> tuple[type[NoScheduleError], tuple[str, float | None]]:
+        # Pickling restores an exception from its arguments alone, without the bound.
+        return type(self), (str(self), self.bound)
+
+
 class Solver(ABC):
     """
     Turns instances into schedules.
 
-    :ivar uses_time_limit: Whether it may find other schedules with another time limit; if not, evaluations at several time
-        limits run it once
-    :ivar name: How tables and files call it
+    :ivar uses_time_limit: Whether the schedules may depend on the time limit; if not, evaluations at several time limits run
+        the solver once
+    :ivar name: Label in tables and files
     :ivar spec: The text that :func:`~sb3_uav.solvers.registry.make_solver` made it from
-    :ivar files: Files that it was made from, by their purpose; evaluations record their hashes
+    :ivar files: Files that it was loaded from, by their purpose; evaluations record their hashes
     """
 
     uses_time_limit: bool = True
@@ -48,43 +67,43 @@ class Solver(ABC):
     spec: str | None = None
     files: Mapping[str, Path] = {}
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any] | None:
         """
-        :return: What decides its results beside instances, time limit and seed, as plain data; results of earlier evaluations
-            are used again only if it is the same
+        :return: Plain data that the results depend on, besides instances, time limit and seed; earlier results are reused only
+            if it is the same. None for a solver that has no results
         """
         return {} if self.spec is None else {"spec": self.spec}
 
     def check(self, instances: Instances) -> None:  # noqa: B027 (most solvers take any instances)
         """
-        Called for all instances before any solver runs, so that a long evaluation does not fail half-way.
+        Called for all instances before any solver runs, so that a long evaluation does not fail halfway.
 
-        :param instances: What is going to be solved
-        :raises ValueError: If the solver cannot treat them; the message says why
+        :param instances: The instances to solve
+        :raises ValueError: If the solver cannot solve them; the message says why
         """
 
     def prepare(self) -> None:  # noqa: B027 (most solvers have nothing to prepare)
         """
-        Called in every process before it solves an instance, often more than once; what it takes does not count as time of the
-        instance. For what is the same for all of them, such as loading code.
+        Called in every process before it solves an instance, often more than once. For preparations that are independent of
+        the instance, such as loading code; their time is not counted.
         """
 
     @abstractmethod
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         """
         :param instances: ``batch`` instances on the CPU, possibly padded
-        :param time_limit: Seconds per instance for solvers that can use more or less of them; their own default when None.
-            Others ignore it
-        :param seed: Of all the randomness; without a time limit the same seed gives the same schedules
+        :param time_limit: Seconds per instance, for solvers that use a time limit; their own default when None
+        :param seed: Seed for all random numbers; without a time limit the same seed gives the same schedules
         :return: One result per instance
-        :raises ValueError: If the solver cannot treat these instances, see :meth:`check`
+        :raises ValueError: If the solver cannot solve these instances, see :meth:`check`
+        :raises NoScheduleError: If it found no schedule for one of them
         """
 
     def solve_rows(
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
     ) -> Iterator[tuple[int, SolverResult]]:
         """
-        Solve some of the instances exactly as :meth:`solve` solves them among all, and hand out what is known already.
+        Solve some of the instances, with the same results as :meth:`solve` on all of them, and yield each as it becomes known.
 
         :param instances: ``batch`` instances on the CPU, possibly padded
         :param rows: Indices of those to solve
@@ -102,7 +121,7 @@ class Solver(ABC):
 class Solution(NamedTuple):
     """
     :param schedule: The schedule
-    :param bound: A proven upper bound of the objective, where the solver knows one
+    :param bound: A proven upper bound of the objective, if the solver has one
     """
 
     schedule: Schedule
@@ -110,31 +129,36 @@ class Solution(NamedTuple):
 
 
 class OneByOneSolver(Solver):
-    """A solver that treats every instance alone, with random numbers that depend on the seed and its row only."""
+    """A solver that solves each instance alone, with random numbers that depend only on the seed and the row."""
 
     @abstractmethod
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         """
-        :param instance: A batch of one, without padding
+        :param instance: A batch of one, without padding, without the tasks that cannot count, and with at most as many UAVs
+            as there are tasks
         :param time_limit: Seconds, or None for the solver's own default
         :param rng: The source of randomness
         :return: The schedule, and a bound where one is known
+        :raises NoScheduleError: If there is none
         """
 
     def solve_row(self, instance: Instances, row: int, time_limit: float | None = None, seed: int = 0) -> SolverResult:
         """
         :param instance: A batch of one, possibly padded
-        :param row: Its index in what is being solved
+        :param row: Its row index in the solved batch
         :param time_limit: As for :meth:`solve`
         :param seed: As for :meth:`solve`
-        :return: What :meth:`solve` finds for that row
+        :return: The result that :meth:`solve` has for that row
         """
         self.prepare()
         start = time.perf_counter()
-        # A row that is all padding keeps one slot, because no instance has none.
-        trimmed = instance.trim(max(int(instance.task_mask.sum()), 1))
-        solution = self.solve_one(trimmed, time_limit, np.random.default_rng([seed, row]))
-        return SolverResult(solution.schedule, time.perf_counter() - start, bound=solution.bound)
+        counting = CountingTasks.of(instance)
+        # A row that is all padding keeps one slot, because every instance has one.
+        n_tasks = max(int(counting.instances.task_mask.sum()), 1)
+        reduced = replace(counting.instances.trim(n_tasks), n_uavs=counting.n_useful_uavs()[0])
+        solution = self.solve_one(reduced, time_limit, keyed_generator(seed, row))
+        schedule = counting.schedule(0, solution.schedule)
+        return SolverResult(schedule, time.perf_counter() - start, bound=solution.bound)
 
     def solve_rows(
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0

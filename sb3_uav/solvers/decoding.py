@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import mixed_state
 from sb3_uav.envs.allocation import plan_tours
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
@@ -16,20 +17,20 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.solvers.shortlists import Block
 
 DECODINGS = ("greedy", "sampling", "augment")
-# Allocations are drawn in blocks of this many per instance, each from random numbers of its own. So memory does not grow with
-# the number of samples, and more samples only add to those that fewer would have drawn.
+# Allocations are drawn in blocks of this many per instance, each from its own random numbers: memory does not grow with the
+# number of samples, and a larger number only adds to the samples of a smaller one.
 SAMPLE_BLOCK = 64
-# An allocator that sweeps starts at several gaps between the tasks, in both directions: so the best of 128 samples found 0.6
-# to 1.4 % more tasks than when all began at the widest one. The number of sweeps divides the sizes of blocks.
+# An allocator with sweep starts at several gaps between the tasks, in both directions: the best of 128 samples then found 0.6
+# to 1.4 % more tasks than with the widest gap alone. The number of sweeps divides the block sizes.
 N_SWEEPS = 8
-# Augmentation looks at an instance in so many views, all symmetries swept in both directions, then at samples in the same with
-# sweeps from other gaps.
+# Number of views in augmentation before the sweep starts at another gap: all symmetries, swept in both directions.
 N_DIRECTIONS = 2
 N_VIEWS = N_DIRECTIONS * N_SYMMETRIES
-# It keeps a part of its samples back, to try more tours for the subsets of the best few allocations. Of 128 samples, 96
-# allocations and 8 more tours for each of the best 4 found 0.6 to 1.7 % more tasks than 8 tours for each of 16 allocations.
+# It reserves a part of its samples for more tours of the best few allocations. With 128 samples, 96 allocations and 8 more
+# tours for each of the best 4 found 0.6 to 1.7 % more tasks than 8 tours for each of 16 allocations.
 N_REVISITED, REVISITED_PART = 4, 0.25
-# Under a time limit less is done between two looks at the clock. Twice as many views overran one second at 1,000 tasks.
+# Under a time limit, blocks are smaller, so that the clock is read more often: twice as many views overran one second at
+# 1,000 tasks.
 HURRIED_BLOCK, HURRIED_VIEWS = 16, 2
 
 
@@ -37,7 +38,7 @@ class View(NamedTuple):
     """
     A way to look at an instance.
 
-    :param symmetry: Of the square, 0 for none
+    :param symmetry: Symmetry of the square, 0 for none
     :param sweep: Where the sweep starts and in which direction, as of the allocator's ``task_order``
     """
 
@@ -47,8 +48,8 @@ class View(NamedTuple):
 
 def view_of(number: int) -> View:
     """
-    :param number: Of an allocation in augmentation, from 0
-    :return: How the allocator looks at it: after all symmetries in both directions, the sweep starts at another gap
+    :param number: Number of an allocation in augmentation, from 0
+    :return: Its view: after all symmetries in both directions, the sweep starts at another gap
     """
     turn, number = divmod(number, N_VIEWS)
     return View(number // N_DIRECTIONS, turn * N_DIRECTIONS + number % N_DIRECTIONS)
@@ -58,7 +59,7 @@ class Allocations(NamedTuple):
     """
     Several allocations of one instance.
 
-    :param instances: ``n_allocations`` times the instance, as the allocator saw it
+    :param instances: The instance, repeated ``n_allocations`` times, as the allocator saw it
     :param order: ``(n_allocations, n_tasks)`` int64, which task stands in each place
     :param assignment: ``(n_allocations, n_tasks)`` int64, the UAV of the task in each place
     """
@@ -70,7 +71,7 @@ class Allocations(NamedTuple):
     def first(self, n_allocations: int) -> Allocations:
         """
         :param n_allocations: How many to keep
-        :return: Only these
+        :return: The first of the allocations
         """
         return Allocations(self.instances[:n_allocations], self.order[:n_allocations], self.assignment[:n_allocations])
 
@@ -98,9 +99,9 @@ class Decoder:
     def blocks(self, instances: Instances, rows: Sequence[int], seed: int, hurry: bool) -> Iterator[Block]:
         """
         :param instances: ``batch`` instances on the allocator's device
-        :param rows: Their indices in what is being solved
-        :param seed: Of the samples
-        :param hurry: Whether to begin with the greedy decoding and to draw fewer samples at once
+        :param rows: Their row indices in the solved batch
+        :param seed: Seed for sampling
+        :param hurry: Whether to start with greedy decoding and to use smaller blocks
         :return: Schedules for all instances, block by block
         """
         if self.decode == "greedy" or hurry:
@@ -123,13 +124,13 @@ class Decoder:
     def _views(self, instances: Instances, rows: Sequence[int], seed: int, hurry: bool) -> Iterator[Block]:
         """
         :param instances: ``batch`` instances on the allocator's device
-        :param rows: Their indices in what is being solved
-        :param seed: Of the samples
-        :param hurry: Whether to look at few views at once
-        :return: Schedules of all views, the first of which have greedy allocations; at last more tours for the best of them
+        :param rows: Their row indices in the solved batch
+        :param seed: Seed for sampling
+        :param hurry: Whether to use smaller blocks
+        :return: Schedules of all views, the first of which have greedy allocations; then more tours for the best allocations
         """
         n_tours = int(REVISITED_PART * self.samples) // N_REVISITED
-        # One more tour would be the greedy one again.
+        # A single tour would repeat the greedy one.
         n_allocations = self.samples - (N_REVISITED * n_tours if n_tours > 1 else 0)
         size = HURRIED_VIEWS if hurry else N_VIEWS
         values, assignments = [], []
@@ -157,16 +158,17 @@ class Decoder:
         """
         :param n_tours: How many tours to try for each subset
         :param generator: The source of randomness
+        :return: A router that tries them
         """
         return lambda subsets: self.router.plan(subsets, None, n_tours, generator)
 
     def look(self, instance: Instances, views: Sequence[View], generator: th.Generator, n_samples: int = 0) -> Allocations:
         """
         :param instance: A batch of one on the allocator's device
-        :param views: How to look at it
+        :param views: Its views
         :param generator: The source of randomness
         :param n_samples: How many allocations to sample in each view; 0 to decode one greedily
-        :return: First a sample of each view, then a second one of each, and so on
+        :return: The first sample of each view, then the second of each, and so on
         """
         shown = [reflect(instance, view.symmetry) for view in views]
         orders = th.cat([self.allocator.task_order(seen, view.sweep) for view, seen in zip(views, shown, strict=True)])
@@ -177,7 +179,7 @@ class Decoder:
 
     def _plan(self, looks: Sequence[Allocations]) -> Block:
         """
-        :param looks: Equally many allocations of each instance
+        :param looks: Allocations of each instance, equally many
         :return: Their schedules
         """
         instances, order = Instances.concatenate([look.instances for look in looks]), th.cat([look.order for look in looks])
@@ -188,11 +190,11 @@ class Decoder:
 
 def random_generator(instances: Instances, *seed: int) -> th.Generator:
     """
-    :param instances: On the device where random numbers are needed
-    :param seed: What the random numbers depend on
+    :param instances: Instances on the device where random numbers are needed
+    :param seed: Numbers that the random numbers depend on
+    :return: The source of randomness
     """
-    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
-    return th.Generator(instances.device).manual_seed(int(state[0] >> np.uint64(1)))
+    return th.Generator(instances.device).manual_seed(int(mixed_state(*seed) >> np.uint64(1)))
 
 
 def tours_of_tasks(tours: th.Tensor, order: th.Tensor) -> th.Tensor:

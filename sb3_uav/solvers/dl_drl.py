@@ -21,22 +21,22 @@ from sb3_uav.solvers.shortlists import Shortlists
 
 class DLDRL(BatchedSolver):
     """
-    DL-DRL: an allocator and a router, both trained; and what makes schedules better afterwards, if it is asked for.
+    DL-DRL: a trained allocator and a trained router, with optional repair and polishing of their schedules.
 
-    What it finds for an instance depends on the seed and the row of the instance, not on ``batch_size`` (but for rounding
-    errors of the networks, and but for time limits). The router is greedy, except with ``"augment"``.
+    The schedule of an instance depends on the seed and on the row of the instance, but not on ``batch_size``, apart from
+    rounding errors of the networks and from time limits. The router is greedy, except with ``"augment"``.
 
     :param allocator: The upper level's policy
     :param router: The lower level's policy
     :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to spend the
         samples on views of the instance (its symmetries) and on more tours for the UAVs of the best allocations. An allocator
-        that wants the tasks swept gets them in both directions and from several starts, except with ``"greedy"``
+        with ``sweep`` gets the tasks in both directions and from several starts, except with ``"greedy"``
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
-    :param name: How tables and files call it; says what it does when None
+    :param name: Label in tables and files; describes the decoding when None
     :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.local_search.search.repair`
-    :param polish: For how many seconds per instance to go on from the best, see :func:`~sb3_uav.solvers.postprocess.polish`
-    :param time_limit: Seconds per instance in all, on average over a batch, when :meth:`solve` is given none: a part of them
+    :param polish: Seconds per instance for improving the best schedule, see :func:`~sb3_uav.solvers.postprocess.polish`
+    :param time_limit: Seconds per instance in all, averaged over a batch, when :meth:`solve` is given none: a part of them
         limits the number of samples, the rest is for repair and polish
     :raises ImportError: If numba is needed and not installed
     :raises ValueError: If an argument is not allowed
@@ -61,11 +61,12 @@ class DLDRL(BatchedSolver):
         super().__init__(batch_size)
         self.allocator = allocator
         self.router = router
+        self.serves_any_fleet = allocator.n_uavs is None
         self.decode = decode
         self.samples = samples
         self.refinement = Refinement(repair, polish)
         self.time_limit = time_limit
-        # Plain networks come to an end by themselves.
+        # Decoding alone always ends.
         self.uses_time_limit = self.refinement.is_wanted or time_limit is not None
         self.name = f"DL-DRL ({self._decoding})" if name is None else name
         if time_limit is not None:
@@ -78,7 +79,7 @@ class DLDRL(BatchedSolver):
 
     def untrained(self, seed: int = 0) -> DLDRL:
         """
-        :param seed: Of the parameters
+        :param seed: Seed for the initial parameters
         :return: The same solver with networks of the same architecture that have learned nothing
         """
         allocator, router = self.allocator.untrained_copy(seed), self.router.untrained_copy(seed + 1)
@@ -112,7 +113,7 @@ class DLDRL(BatchedSolver):
         self.allocator.set_training_mode(False)
         decoder = Decoder(self.allocator, self.router, self.decode, self.samples)
         found = Shortlists(len(instances), self.refinement.n_candidates)
-        # Of a first block nothing is known; afterwards none is begun that would probably end too late.
+        # How long the first block takes is unknown; afterwards, no block is started that would probably end too late.
         before = start
         for block in decoder.blocks(instances, rows, seed, hurry=time_limit is not None):
             found.add(block)
@@ -142,7 +143,7 @@ def load_dl_drl(
     :param device: Device of the networks
     :param batch_size: How many instances to solve at once; as many as memory allows when None
     :param repair: Whether to repair the best of the schedules
-    :param polish: For how many seconds per instance to go on from the best
+    :param polish: Seconds per instance for improving the best schedule
     :param time_limit: Seconds per instance in all
     :return: The solver
     :raises FileNotFoundError: If a zip is missing

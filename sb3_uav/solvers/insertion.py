@@ -1,6 +1,8 @@
-"""Cheapest insertion: the trivial reference among the solvers that plan all tours at once."""
+"""Cheapest insertion: a simple baseline that plans all tours at once."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -26,19 +28,21 @@ class GreedyInsertion(OneByOneSolver):
         return Solution(reduced.schedule(insert_greedily(reduced)))
 
 
-def insert_greedily(reduced: ReducedInstance) -> list[list[int]]:
+def insert_greedily(reduced: ReducedInstance, given: Sequence[Sequence[int]] = ()) -> list[list[int]]:
     """
     :param reduced: What to plan
+    :param given: Routes to start from, as nodes; empty ones when there are fewer than useful UAVs
     :return: One route per useful UAV, as nodes
     """
-    routes: list[list[int]] = [[] for _ in range(reduced.n_uavs)]
+    routes = [list(route) for route in given] + [[] for _ in range(reduced.n_uavs - len(given))]
     if reduced.n_tasks == 0:
         return routes
-    slack = np.ones(reduced.n_uavs)
+    slack = np.array([1.0 - reduced.tour_length(route) for route in routes])
     # Of every task into every tour: the least added length, and the position where it is least.
-    detour = np.tile(2 * reduced.distances[0, 1:], (reduced.n_uavs, 1))
-    position = np.zeros(detour.shape, dtype=np.int64)
+    positions, detours = zip(*(_cheapest_insertions(reduced, route) for route in routes), strict=True)
+    position, detour = np.stack(positions), np.stack(detours)
     free = np.ones(reduced.n_tasks, dtype=bool)
+    free[[node - 1 for route in routes for node in route]] = False
     while True:
         rate = np.where(free & (detour <= slack[:, None]), reduced.values / np.maximum(detour, SMALLEST_DETOUR), 0.0)
         uav, task = np.unravel_index(rate.argmax(), rate.shape)
@@ -47,8 +51,16 @@ def insert_greedily(reduced: ReducedInstance) -> list[list[int]]:
         routes[uav].insert(position[uav, task], int(task) + 1)
         slack[uav] -= detour[uav, task]
         free[task] = False
-        stops = np.array([0, *routes[uav], 0])
-        to_stops = reduced.distances[stops, 1:]
-        added = to_stops[:-1] + to_stops[1:] - reduced.distances[stops[:-1], stops[1:]][:, None]
-        position[uav] = added.argmin(0)
-        detour[uav] = added.min(0)
+        position[uav], detour[uav] = _cheapest_insertions(reduced, routes[uav])
+
+
+def _cheapest_insertions(reduced: ReducedInstance, route: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param reduced: What to plan
+    :param route: A route, as nodes
+    :return: Of every task, the place in the route where it adds the least length, ``(n,)`` int64, and that length, ``(n,)``
+    """
+    stops = np.array([0, *route, 0])
+    to_stops = reduced.distances[stops, 1:]
+    added = to_stops[:-1] + to_stops[1:] - reduced.distances[stops[:-1], stops[1:]][:, None]
+    return added.argmin(0), added.min(0)

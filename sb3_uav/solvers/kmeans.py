@@ -26,7 +26,7 @@ def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restar
     :param points: ``(n_points, 2)``
     :param n_clusters: Number of clusters; some stay empty if there are fewer distinct points
     :param rng: The source of randomness
-    :param restarts: Number of starts, of which the one with the smallest sum of squared distances is kept
+    :param restarts: Number of starts; the clustering with the smallest sum of squared distances is kept
     :return: ``(n_points,)`` int64, the cluster of each point
     """
     # In a unit square, so that squares of very small or large coordinates neither vanish nor overflow.
@@ -34,44 +34,44 @@ def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restar
     points = points / (points.max() or 1.0)
     best: tuple[float, np.ndarray] | None = None
     for _ in range(restarts):
-        labels, inertia = _lloyd(points, _spread_centres(points, n_clusters, rng))
+        labels, inertia = _lloyd(points, _spread_centers(points, n_clusters, rng))
         if best is None or inertia < best[0]:
             best = inertia, labels
     assert best is not None
     return best[1]
 
 
-def _spread_centres(points: np.ndarray, n_clusters: int, rng: np.random.Generator) -> np.ndarray:
+def _spread_centers(points: np.ndarray, n_clusters: int, rng: np.random.Generator) -> np.ndarray:
     """
-    k-means++: each next centre is a point drawn with probability proportional to its squared distance to the centres so far.
+    k-means++: each next centre is a point drawn with probability proportional to its squared distance to the centers so far.
 
     :return: ``(n_clusters, 2)``
     """
-    centres = points[rng.integers(len(points))][None]
+    centers = points[rng.integers(len(points))][None]
     nearest = np.full(len(points), np.inf)
-    while len(centres) < n_clusters:
-        nearest = np.minimum(nearest, np.square(points - centres[-1]).sum(-1))
+    while len(centers) < n_clusters:
+        nearest = np.minimum(nearest, np.square(points - centers[-1]).sum(-1))
         cumulated = nearest.cumsum()
-        # One past the end if every point is a centre already; its cluster then stays empty.
+        # One past the end if every point is a center already; its cluster then stays empty.
         drawn = np.searchsorted(cumulated, rng.random() * cumulated[-1], side="right")
-        centres = np.vstack([centres, points[min(drawn, len(points) - 1)]])
-    return centres
+        centers = np.vstack([centers, points[min(drawn, len(points) - 1)]])
+    return centers
 
 
-def _lloyd(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, float]:
+def _lloyd(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, float]:
     """
     :param points: ``(n_points, 2)``
-    :param centres: ``(n_clusters, 2)``
-    :return: The cluster of each point, ``(n_points,)`` int64, and the sum of squared distances to their centres
+    :param centers: ``(n_clusters, 2)``
+    :return: The cluster of each point, ``(n_points,)`` int64, and the sum of squared distances to their centers
     """
     labels = np.full(len(points), -1)
     for _ in range(MAX_LLOYD_ITERATIONS):
-        distances = np.square(points[:, None] - centres).sum(-1)
+        distances = np.square(points[:, None] - centers).sum(-1)
         previous, labels = labels, distances.argmin(1)
         if np.array_equal(labels, previous):
             break
-        counts = np.bincount(labels, minlength=len(centres))
-        sums = np.stack([np.bincount(labels, weights=axis, minlength=len(centres)) for axis in points.T], axis=1)
-        # A cluster that has lost all its points keeps its centre.
-        centres = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], centres)
-    return labels, float(np.square(points - centres[labels]).sum())
+        counts = np.bincount(labels, minlength=len(centers))
+        sums = np.stack([np.bincount(labels, weights=axis, minlength=len(centers)) for axis in points.T], axis=1)
+        # A cluster that has lost all its points keeps its center.
+        centers = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], centers)
+    return labels, float(np.square(points - centers[labels]).sum())

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 
+from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.envs.allocation import UNASSIGNED, plan_tours, schedules
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
@@ -22,10 +22,10 @@ class KMeansAM(BatchedSolver):
     """
     K-means gives every UAV a cluster of tasks, the trained router plans its tour, greedily.
 
-    With the same seed and restarts the clusters are those of ``kmeans-nearest``.
+    With the same seed and number of restarts, the clusters are those of ``kmeans-nearest``.
 
     :param router: The lower level's policy
-    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :param restarts: Number of starts of K-means; the most compact clusters are kept
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :raises ValueError: If an argument is not allowed
     """
@@ -46,11 +46,11 @@ class KMeansAM(BatchedSolver):
     def solve_batch(
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
-        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED)
+        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
         for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
             if n_tasks > 0:
                 points = instances.tasks[i, :n_tasks].numpy()
-                clusters = kmeans(points, instances.n_uavs, np.random.default_rng([seed, row]), self.restarts)
+                clusters = kmeans(points, instances.n_uavs, keyed_generator(seed, row), self.restarts)
                 assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
         return schedules(plan_tours(instances, assignment, self.router.plan).tours[:, 0])
 
@@ -58,7 +58,7 @@ class KMeansAM(BatchedSolver):
 def load_kmeans_am(router: str, restarts: int = 10, device: str = "auto", batch_size: int | None = None) -> KMeansAM:
     """
     :param router: SB3 zip of the router
-    :param restarts: How many times K-means starts anew
+    :param restarts: Number of starts of K-means
     :param device: Device of the network
     :param batch_size: How many instances to solve at once; as many as memory allows when None
     :return: The solver

@@ -1,4 +1,4 @@
-"""K-means and variable neighbourhood descent: the paper's conventional baseline in a fast form."""
+"""K-means and variable neighborhood descent: the paper's conventional baseline in a fast form."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sb3_uav.solvers.nearest_task import nearest_feasible_schedule
 
 class KMeansVND(OneByOneSolver):
     """
-    K-means clusters of the tasks, one for every UAV, and variable neighbourhood descent on each (the paper's K-means+VND).
+    K-means clusters of the tasks, one for every UAV, and variable neighborhood descent on each (the paper's K-means+VND).
 
-    Every tour starts with the nearest feasible tasks of its cluster. Three neighbourhoods follow one another until none has
-    anything better: shorter tours (2-opt, or-opt), insertion of a task that is left over, and replacement of a visited task by
-    one that is worth more or as much on a shorter tour. Tours exchange no tasks.
+    Every tour starts with the nearest feasible tasks of its cluster. Three neighborhoods are searched in turn until none has
+    an improvement: shorter tours (2-opt, or-opt), insertion of an unvisited task, and replacement of a visited task by one
+    that is worth more, or as much on a shorter tour. Tours exchange no tasks.
 
-    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :param restarts: Number of starts of K-means; the most compact clusters are kept
     :raises ValueError: If there is not at least one start
     :raises ImportError: If numba is not installed
     """
@@ -46,7 +46,7 @@ class KMeansVND(OneByOneSolver):
 
 @cache
 def _warm_up() -> None:
-    """Once in a process. Imported when needed, because numba may be missing and this class is told of even then."""
+    """Run once per process. Imported on use, because this module must load even without numba."""
     from sb3_uav.local_search.search import warm_up
 
     warm_up()

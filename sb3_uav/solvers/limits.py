@@ -1,4 +1,4 @@
-"""What the solvers share that search until a time limit, or that need a package of their own."""
+"""Time limits of solvers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from sb3_uav.solvers.unavailable import UnavailableError
 
 
 class TimeLimitError(UnavailableError):
-    """A time limit that leaves no time, or never ends."""
+    """A time limit that is not a finite number above 0."""
 
 
 def deadline_after(time_limit: float, whose: str) -> float:
     """
     :param time_limit: Seconds from now
-    :param whose: What has this limit, named in errors
-    :return: When it ends, in seconds of ``time.perf_counter``
+    :param whose: Name of the solver, for errors
+    :return: End of the time limit, in seconds of ``time.perf_counter``
     :raises TimeLimitError: If the limit is not a finite number above 0
     """
     if not 0 < time_limit < math.inf:
@@ -40,7 +40,7 @@ class TimeLimitedSolver(OneByOneSolver):
     def deadline(self, time_limit: float | None) -> float:
         """
         :param time_limit: Seconds from now, or None for the solver's own limit
-        :return: When it ends, in seconds of ``time.perf_counter``
+        :return: End of the time limit, in seconds of ``time.perf_counter``
         :raises TimeLimitError: If the limit is not a finite number above 0
         """
         return deadline_after(self.time_limit if time_limit is None else time_limit, self.name)

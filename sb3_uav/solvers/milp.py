@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.reduction import ReducedInstance
-from sb3_uav.solvers.base import Solution
+from sb3_uav.solvers.base import NoScheduleError, Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver
 from sb3_uav.solvers.programs import BACKENDS, Program, Rows
 
@@ -67,8 +67,9 @@ class MILP(TimeLimitedSolver):
 
     It is built for what makes it exact: without tasks that no UAV can reach, for which (8) has no solution; with coincident
     tasks as one place, because (7) allows cycles of length 0; and with no more UAVs than places, because (5) sends every UAV
-    out. Tasks count with their value in (1). What a solver's tolerances let through all the same is forbidden, and the program
-    solved again. At the time limit, the best schedule so far is returned, which may be an empty one, and the proven bound.
+    out. Tasks count with their value in (1). Cycles that a solver's tolerances admit nevertheless are forbidden, and the
+    program is solved again. At the time limit, the best schedule so far is returned with the proven bound; without one,
+    :class:`~sb3_uav.solvers.base.NoScheduleError` is raised, which holds the bound.
 
     Nothing is added against the symmetry of identical UAVs: that speeds up proofs for ten tasks, but HiGHS then finds no
     schedule at all for eighty.
@@ -78,7 +79,7 @@ class MILP(TimeLimitedSolver):
     :param threads: How many threads the backend may use
     :raises ImportError: If the backend is not installed
     :raises ValueError: If an argument is not allowed
-    :raises UnavailableError: If Gurobi finds no valid licence
+    :raises UnavailableError: If Gurobi finds no valid license
     """
 
     name = "milp"
@@ -94,7 +95,7 @@ class MILP(TimeLimitedSolver):
 
     def check(self, instances: Instances) -> None:
         """
-        :param instances: What is going to be solved
+        :param instances: The instances to solve
         :raises ValueError: If the model of one of them is too large for the backend
         """
         for row in range(len(instances)):
@@ -105,6 +106,7 @@ class MILP(TimeLimitedSolver):
                 raise ValueError(f"instance {row}: {error}.") from error
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
+        time_limit = self.time_limit if time_limit is None else time_limit
         deadline = self.deadline(time_limit)
         seed = int(rng.integers(2**30))
         reduced = ReducedInstance.of(instance)
@@ -129,10 +131,13 @@ class MILP(TimeLimitedSolver):
             if len(found) == len(cycles):
                 break
             forbidden += [cycle for cycle in cycles if not places.is_tour(cycle)]
+        bound = float(max(bound, free_value + value))
+        if len(places.values) > 0 and value == 0:
+            raise NoScheduleError(f"no schedule found within the time limit of {time_limit:g} s; bound {bound:g}", bound)
         routes = [[node for place in tour[1:] for node in places.nodes[place]] for tour in tours]
         # Tasks at the depot cost nothing.
         routes[0] += places.nodes[0]
-        return Solution(reduced.schedule(routes), float(max(bound, free_value + value)))
+        return Solution(reduced.schedule(routes), bound)
 
 
 def _arcs(n_places: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Simple splits of the tasks, each followed by flights to the nearest feasible task: what a trained pair must beat."""
+"""Simple splits of the tasks, each followed by flights to the nearest feasible task, as baselines."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class KMeansNearest(OneByOneSolver):
     """
     K-means clusters of the tasks, one for every UAV, and every UAV flies to its nearest feasible task.
 
-    :param restarts: How many times K-means starts anew; the most compact clusters are kept
+    :param restarts: Number of starts of K-means; the most compact clusters are kept
     :raises ValueError: If there is not at least one start
     """
 

@@ -1,4 +1,4 @@
-"""Solvers that treat many instances at once, as networks do."""
+"""Solvers that solve many instances at once, as networks do."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import torch as th
 
@@ -13,17 +14,20 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.solvers.base import Solver, SolverResult
+from sb3_uav.solvers.counting_tasks import CountingTasks
 
 
 class BatchedSolver(Solver):
     """
-    A solver that treats as many instances at once as memory allows.
+    A solver that solves as many instances at once as memory allows.
 
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :raises ValueError: If it is less than 1
+    :ivar serves_any_fleet: Whether it can solve an instance with fewer UAVs than :meth:`check` admitted
     """
 
     uses_time_limit = False
+    serves_any_fleet = True
 
     def __init__(self, batch_size: int | None = None) -> None:
         if batch_size is not None and batch_size < 1:
@@ -33,8 +37,8 @@ class BatchedSolver(Solver):
     @abstractmethod
     def rows_that_fit(self, instances: Instances) -> int:
         """
-        :param instances: What is being solved
-        :return: How many of them fit into the memory at once, at least 1
+        :param instances: The instances to solve
+        :return: How many of them fit into memory at once, at least 1
         """
 
     @abstractmethod
@@ -42,41 +46,50 @@ class BatchedSolver(Solver):
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
         """
-        :param instances: ``batch`` instances, trimmed to the largest of them
-        :param rows: Their indices in what is being solved, on which random numbers depend
-        :param seed: Of all the randomness
+        :param instances: ``batch`` instances, trimmed to the largest of them and without the tasks that cannot count
+        :param rows: Their row indices in the solved batch, on which random numbers depend
+        :param seed: Seed for all random numbers
         :param time_limit: Seconds per instance, on average, for solvers that use it
-        :return: A schedule for each
+        :return: A schedule for each instance
         """
 
     def solve_rows(
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0
     ) -> Iterator[tuple[int, SolverResult]]:
         self.check(instances)
-        fitting = self.rows_that_fit(instances)
-        batch_size = min(self.batch_size or fitting, fitting)
-        for first in range(0, len(rows), batch_size):
-            taken = list(rows[first : first + batch_size])
-            start = time.perf_counter()
-            batch = instances[taken]
-            n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
-            found = self.solve_batch(batch.trim(n_tasks), taken, seed, time_limit)
-            seconds = (time.perf_counter() - start) / len(taken)
-            for row, schedule in zip(taken, found, strict=True):
-                yield row, SolverResult(schedule, seconds, len(taken))
+        if len(rows) == 0:
+            return
+        counting = CountingTasks.of(instances[list(rows)])
+        fleets = counting.n_useful_uavs() if self.serves_any_fleet else [instances.n_uavs] * len(rows)
+        # A batch holds fleets of one size, so that the schedule of an instance does not depend on the others in its batch.
+        for n_uavs in dict.fromkeys(fleets):
+            group = replace(counting.instances, n_uavs=n_uavs)
+            places = [place for place, fleet in enumerate(fleets) if fleet == n_uavs]
+            fitting = self.rows_that_fit(group)
+            batch_size = min(self.batch_size or fitting, fitting)
+            for first in range(0, len(places), batch_size):
+                taken = places[first : first + batch_size]
+                start = time.perf_counter()
+                batch = group[taken]
+                n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
+                found = self.solve_batch(batch.trim(n_tasks), [rows[place] for place in taken], seed, time_limit)
+                seconds = (time.perf_counter() - start) / len(taken)
+                for place, schedule in zip(taken, found, strict=True):
+                    yield rows[place], SolverResult(counting.schedule(place, schedule), seconds, len(taken))
 
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
-        return [result for _, result in self.solve_rows(instances, range(len(instances)), time_limit, seed)]
+        results = dict(self.solve_rows(instances, range(len(instances)), time_limit, seed))
+        return [results[row] for row in range(len(instances))]
 
 
 def parameters_hash(policy: EpisodicPolicy) -> str:
     """
     :param policy: Any policy of ours
-    :return: SHA-256 of its parameters and buffers, the same on every device and whatever file they came from
+    :return: SHA-256 of its parameters and buffers, which depends neither on the device nor on the file
     """
     digest = hashlib.sha256()
     for name, value in policy.state_dict().items():
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
-        # As bytes, because numpy has no bfloat16.
+        # As bytes, because NumPy has no bfloat16.
         digest.update(value.detach().cpu().flatten().view(th.uint8).numpy().tobytes())
     return digest.hexdigest()

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
+from sb3_uav.envs.reduction import FINE_RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver
@@ -48,7 +48,7 @@ class ORToolsGLS(TimeLimitedSolver):
     """
     The same with OR-Tools' guided local search until the time limit.
 
-    It goes on to the limit even when all tasks are visited, because OR-Tools then still shortens the tours.
+    It runs until the limit even when all tasks are visited, because OR-Tools then still shortens the tours.
 
     :param time_limit: Seconds per instance
     :raises ImportError: If OR-Tools is not installed
@@ -79,7 +79,8 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
     :param solver: Name of the solver, for errors
     :param instance: A batch of one
     :param deadline: When guided local search ends, in seconds of ``time.perf_counter``; plain local search when None
-    :return: The schedule; an empty one if the deadline came before the first solution
+    :return: The schedule; at least a first one, even if the deadline comes before it
+    :raises RuntimeError: If OR-Tools fails
     """
     pywrapcp = _require_routing(solver)
     reduced = ReducedInstance.of(instance)
@@ -87,14 +88,17 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
         return reduced.schedule([])
     manager = pywrapcp.RoutingIndexManager(reduced.n_tasks + 1, reduced.n_uavs, 0)
     routing = pywrapcp.RoutingModel(manager)
-    transit = routing.RegisterTransitMatrix(reduced.integer_distances().tolist())
-    routing.SetArcCostEvaluatorOfAllVehicles(transit)
-    routing.AddDimension(transit, 0, RESOLUTION, True, "distance")
+    routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(reduced.coarse_distances().tolist()))
+    flown = routing.RegisterTransitMatrix(reduced.fine_distances().tolist())
+    routing.AddDimension(flown, 0, FINE_RESOLUTION, True, "distance")
     for node, penalty in enumerate(reduced.integer_prizes(LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
         routing.AddDisjunction([manager.NodeToIndex(node)], penalty)
     solution = routing.SolveWithParameters(_search_parameters(pywrapcp, deadline))
+    if solution is None and deadline is not None:
+        # The time was up before the first solution, which takes little time.
+        solution = routing.SolveWithParameters(_first_solution_parameters(pywrapcp))
     if solution is None:
-        return reduced.schedule([])
+        raise RuntimeError("OR-Tools found no schedule, although an empty one is feasible.")
     routes = []
     for uav in range(reduced.n_uavs):
         route = []
@@ -104,6 +108,16 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
             index = solution.Value(routing.NextVar(index))
         routes.append(route)
     return reduced.schedule(routes)
+
+
+def _first_solution_parameters(pywrapcp: Any) -> Any:
+    """
+    :param pywrapcp: The module
+    :return: OR-Tools' search parameters, to end with the first solution
+    """
+    parameters = _search_parameters(pywrapcp, None)
+    parameters.solution_limit = 1
+    return parameters
 
 
 def _search_parameters(pywrapcp: Any, deadline: float | None) -> Any:

@@ -1,4 +1,4 @@
-"""What makes the schedules of the networks better, reported apart from them: repair and polish."""
+"""Repair and polishing of the networks' schedules, always reported separately from the networks alone."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 
-# How many of the best schedules of an instance are repaired, in some milliseconds each. Of 128, 64 gave 0.2 to 0.8 % more
-# tasks than 8 at 80 to 200 tasks, and all of them no more.
+# How many of the best schedules of an instance are repaired, in a few milliseconds each. Of 128, repairing 64 gave 0.2 to
+# 0.8 % more tasks than repairing 8 at 80 to 200 tasks; repairing all gave no more.
 N_REPAIRED = 64
-# The part of the polishing that ruin and recreate gets before PyVRP. In one second, from the same schedules, it found more
-# than PyVRP from 500 tasks on and less at 80 to 200; PyVRP with the second half lost nothing of either.
+# Fraction of the polishing time for ruin and recreate, before PyVRP. In one second, from the same schedules, ruin and recreate
+# found more than PyVRP from 500 tasks on, and less at 80 to 200 tasks; half and half was as good as the better of the two.
 RUIN_SHARE = 0.5
-# The part of a time limit that is kept for it.
+# Fraction of a time limit reserved for repair, and for polishing.
 REPAIR_SHARE, POLISH_SHARE = 0.3, 0.75
-# Where the networks have used up all the time, schedules are repaired for so long nevertheless.
+# Seconds for the repair when the networks have used up the time limit.
 LEAST_REPAIR_SECONDS = 0.05
 
 
@@ -29,10 +29,10 @@ class Refinement:
     """
     Repairs and polishes schedules.
 
-    Instances are treated in threads, as many at once as torch may use; compiled code and PyVRP do most of the work.
+    Works on several instances at once, in as many threads as torch may use; compiled code and PyVRP do most of the work.
 
     :param repair: Whether to repair the best schedules of every instance and keep the best
-    :param polish: Seconds per instance to go on from there; 0 for none
+    :param polish: Seconds per instance for further improvement; 0 for none
     :raises ImportError: If a package is needed and not installed
     :raises ValueError: If ``polish`` is negative or not finite
     """
@@ -54,17 +54,17 @@ class Refinement:
 
     @property
     def share(self) -> float:
-        """The part of a time limit that it should be left."""
+        """Fraction of a time limit reserved for it."""
         return POLISH_SHARE if self.polish > 0 else REPAIR_SHARE if self.repair else 0.0
 
     @property
     def n_candidates(self) -> int:
-        """How many schedules of an instance it looks at."""
+        """How many candidate schedules of an instance it considers."""
         return N_REPAIRED if self.repair else 1
 
     @property
     def label(self) -> str:
-        """What it adds to the name of a solver."""
+        """Its part of a solver's name."""
         return (" + repair" if self.repair else "") + (f" + polish {self.polish:g} s" if self.polish > 0 else "")
 
     def __call__(
@@ -74,7 +74,7 @@ class Refinement:
         :param instances: ``batch`` instances on the CPU
         :param candidates: At least one feasible schedule of each, the best first
         :param deadline: When to end, in seconds of ``time.perf_counter``
-        :param seed: Of the polishing
+        :param seed: Seed for polishing
         :return: One schedule for each, not worse than its best candidate
         """
         if not self.is_wanted:
@@ -82,7 +82,7 @@ class Refinement:
         from sb3_uav.local_search.search import repair_best
 
         n_threads = min(th.get_num_threads(), len(instances))
-        # Of the time that is left, every instance gets an equal share, and the polishing, if there is any, three quarters.
+        # The remaining time is divided equally among the instances; polishing, if requested, gets 70 % of it.
         n_rounds = math.ceil(len(instances) / n_threads)
         left = (deadline - time.perf_counter()) / n_rounds
         repairing = left * (REPAIR_SHARE if self.polish > 0 else 1.0)
@@ -99,14 +99,14 @@ class Refinement:
 
 def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 0) -> Schedule:
     """
-    Search on from a schedule: ruin and recreate first, then PyVRP, which starts from what that found.
+    Improve a schedule: first by ruin and recreate, then by PyVRP, starting from its result.
 
-    Without PyVRP (it needs Python 3.11 or newer) ruin and recreate gets all the time.
+    Without PyVRP, which needs Python 3.11 or newer, ruin and recreate gets all the time.
 
     :param instance: A batch of one
     :param schedule: A feasible schedule of it
     :param seconds: Wall time
-    :param seed: Of the random numbers
+    :param seed: Seed for both
     :return: A feasible schedule of at least the same value
     :raises ImportError: If numba is not installed
     :raises ValueError: If the time is not a finite number above 0

@@ -13,17 +13,17 @@ import numpy as np
 from sb3_uav.common.optional import require
 from sb3_uav.solvers.unavailable import UnavailableError
 
-# What the solvers are asked to keep to: in constraints, in integers, and between the best value and its bound.
+# Tolerance that the solvers are given for constraints, for integers, and for the gap between the best value and its bound.
 SOLVER_TOLERANCE = 1e-9
-# Columns, and rows, of the largest program: about 4 GB in HiGHS, and of the largest that Gurobi's free licence admits.
+# Columns, and rows, of the largest program: about 4 GB in HiGHS, and of the largest that Gurobi's free license admits.
 LARGEST_SIZE = 2_000_000
-FREE_LICENCE_SIZE = 2000
+FREE_LICENSE_SIZE = 2000
 
 
 @dataclass(frozen=True)
 class Program:
     """
-    Maximise ``objective @ x`` subject to ``lower <= A x <= upper`` and ``0 <= x <= column_upper``.
+    Maximize ``objective @ x`` subject to ``lower <= A x <= upper`` and ``0 <= x <= column_upper``.
 
     :param objective: ``(n_columns,)``
     :param column_upper: ``(n_columns,)``
@@ -93,7 +93,7 @@ class Rows:
 
 class Answer(NamedTuple):
     """
-    What a backend found.
+    The answer of a backend.
 
     :param columns: ``(n_columns,)``, the best solution; None if there is none yet
     :param bound: Proven upper bound of the objective
@@ -120,8 +120,8 @@ class Backend(ABC):
         :param program: A program that has a solution, and of a size that :meth:`check_size` allows
         :param time_limit: Seconds
         :param threads: Number of threads
-        :param seed: Of the solver
-        :return: What was found
+        :param seed: Seed of the solver
+        :return: The solution and the bound
         """
 
     def check_size(self, n_columns: int, n_rows: int) -> None:
@@ -185,25 +185,25 @@ class HiGHSBackend(Backend):
 class GurobiBackend(Backend):
     """
     :raises ImportError: If gurobipy is not installed
-    :raises UnavailableError: If Gurobi finds no valid licence
+    :raises UnavailableError: If Gurobi finds no valid license
     """
 
     def __init__(self) -> None:
         gurobipy, environment = self._start()
-        # Gurobi has no other way to ask what a licence admits.
+        # Gurobi has no other way to ask what a license admits.
         with environment, gurobipy.Model(env=environment) as model:
-            model.addVars(FREE_LICENCE_SIZE + 1)
+            model.addVars(FREE_LICENSE_SIZE + 1)
             try:
                 model.optimize()
             except gurobipy.GurobiError as error:
                 if error.errno != gurobipy.GRB.Error.SIZE_LIMIT_EXCEEDED:
                     raise self._refused(error) from error
-                self.size_limit = FREE_LICENCE_SIZE
-                self.size_reason = "which is what Gurobi's free licence admits; install another, or use milp:backend=highs"
+                self.size_limit = FREE_LICENSE_SIZE
+                self.size_reason = "which is what Gurobi's free license admits; install another, or use milp:backend=highs"
 
     @staticmethod
     def _refused(error: Exception) -> UnavailableError:
-        return UnavailableError(f"Gurobi found no valid licence ({error}); install one, or use milp:backend=highs.")
+        return UnavailableError(f"Gurobi found no valid license ({error}); install one, or use milp:backend=highs.")
 
     def _start(self) -> tuple[Any, Any]:
         """

@@ -15,6 +15,7 @@ from sb3_uav.envs.reduction import RESOLUTION, ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after
+from sb3_uav.solvers.overlong_tours import with_feasible_tours
 
 # Its interface changes with every minor version.
 SUPPORTED_VERSION = "0.14."
@@ -33,12 +34,12 @@ LARGEST_COST = 2**61
 class PyVRP(TimeLimitedSolver):
     """
     PyVRP's iterated local search: tasks are optional clients whose prizes outweigh all the length that the fleet can save, so
-    that value is maximised first and length minimised second. It ends before the time limit when all tasks are visited.
+    that value is maximized first and length minimized second. It ends before the time limit when all tasks are visited.
 
     :param time_limit: Seconds per instance
-    :param num_neighbours: Size of the granular neighbourhoods
+    :param num_neighbours: Size of the granular neighborhoods
     :raises ImportError: If PyVRP 0.14 is not installed
-    :raises ValueError: If the time limit is not a finite number above 0, or the number of neighbours is below 1
+    :raises ValueError: If the time limit is not a finite number above 0, or the number of neighbors is below 1
     """
 
     name = "pyvrp"
@@ -64,8 +65,8 @@ def polish_schedule(
     :param instance: A batch of one
     :param schedule: A feasible schedule of it
     :param time_limit: Seconds
-    :param seed: Of PyVRP
-    :param num_neighbours: Size of the granular neighbourhoods
+    :param seed: Seed of PyVRP
+    :param num_neighbours: Size of the granular neighborhoods
     :return: A feasible schedule of at least the same value
     :raises ImportError: If PyVRP 0.14 is not installed
     :raises ValueError: If the time limit is not a finite number above 0
@@ -109,8 +110,8 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
     :param instance: A batch of one
     :param initial: Where to start; a random solution when None
     :param deadline: When to stop, in seconds of ``time.perf_counter``
-    :param seed: Of PyVRP
-    :param num_neighbours: Size of the granular neighbourhoods
+    :param seed: Seed of PyVRP
+    :param num_neighbours: Size of the granular neighborhoods
     :return: The best schedule found
     """
     pyvrp = _require_pyvrp("pyvrp")
@@ -131,7 +132,7 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
         return best_cost < least_prize or time.perf_counter() >= deadline
 
     with warnings.catch_warnings():
-        # That penalties reached their bound is no news to the caller, whose instance always has a feasible solution.
+        # Penalties that reach their bound do not matter: an instance always has a feasible solution.
         warnings.simplefilter("ignore", pyvrp.exceptions.PenaltyBoundWarning)
         best = pyvrp.solve(
             data,
@@ -143,11 +144,8 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
             if initial is None
             else pyvrp.Solution(data, [[node - 1 for node in route] for route in reduced.routes(initial)]),
         ).best
-    return reduced.schedule(
-        [activity.idx + 1 for activity in route if activity.is_client()]
-        for route in best.routes()
-        if not route.has_excess_distance()
-    )
+    routes = [[activity.idx + 1 for activity in route if activity.is_client()] for route in best.routes()]
+    return reduced.schedule(with_feasible_tours(reduced, routes))
 
 
 def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> Any:
@@ -157,7 +155,7 @@ def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> A
     :param prizes: ``(n,)`` int64
     :return: PyVRP's description of it; client ``i`` is node ``i + 1``
     """
-    distances = reduced.integer_distances()
+    distances = reduced.coarse_distances()
     return pyvrp.ProblemData(
         # All distances are in the matrix.
         locations=[pyvrp.Location(0, 0)] * len(distances),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import NoneType, UnionType
@@ -33,7 +34,8 @@ def make_solver(spec: str, **defaults: Any) -> Solver:
     Make a solver from text.
 
     :param spec: ``name`` or ``name:key=value,key=value``; the keys are the arguments of the solver's constructor, and
-        ``name``, which tables and files shall call it by
+        ``name``, the label in tables and files. A value with a comma stands in quotes, ``key="a,b"`` or ``key='a,b'``, in
+        which the quote itself is written twice
     :param defaults: Arguments for solvers that have them, where ``spec`` does not give them
     :return: The solver; unless told otherwise its ``name`` is the whole ``spec``, so that variants can be told apart
     :raises ValueError: If the name, a key or a value is not allowed; the message lists the choices
@@ -63,17 +65,46 @@ def solver_factory(spec: str) -> Callable[..., Solver]:
 def solver_label(spec: str) -> str:
     """
     :param spec: As of :func:`make_solver`
-    :return: What tables and files call the solver: the option ``name``, or the whole text
+    :return: Label of the solver in tables and files: the option ``name``, or the whole text
     """
-    options = dict(item.partition("=")[::2] for item in spec.partition(":")[2].split(","))
+    try:
+        options = dict(item.partition("=")[::2] for item in _split_options(spec.partition(":")[2]))
+    except ValueError:
+        return spec
     return options.get("name") or spec
+
+
+def _split_options(text: str) -> list[str]:
+    """
+    :param text: ``key=value,key=value``, values with commas in quotes
+    :return: Each ``key=value``, without the quotes
+    :raises ValueError: If a closing quote is missing, or something other than a comma follows it
+    """
+    items = []
+    while text:
+        plain = re.match(r"[^,=]*=?", text)
+        assert plain is not None
+        value = text[plain.end() :]
+        if plain[0].endswith("=") and value[:1] in ("'", '"'):
+            quote = value[0]
+            quoted = re.match(f"{quote}((?:[^{quote}]|{quote}{quote})*){quote}(,|$)", value)
+            if quoted is None:
+                raise ValueError(
+                    f"The value of {text!r} begins with a quote; end it with another one, followed by a comma or by nothing."
+                )
+            items.append(plain[0] + quoted[1].replace(quote * 2, quote))
+            text = value[quoted.end() :]
+        else:
+            item, _, text = text.partition(",")
+            items.append(item)
+    return [item for item in items if item]
 
 
 def _parse_options(name: str, text: str, factory: Callable[..., Solver], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param name: Name of the solver, for errors
     :param text: ``key=value,key=value``, or nothing
-    :param factory: A class or a function, whose arguments say which keys there are, and of which type
+    :param factory: A class or a function, whose arguments define the keys and their types
     :param defaults: Arguments where the text does not give them
     :return: The arguments
     :raises ValueError: If a key or a value is not allowed, or one is missing
@@ -82,14 +113,14 @@ def _parse_options(name: str, text: str, factory: Callable[..., Solver], default
     choices = {key: _plain_type(parameter.annotation) for key, parameter in parameters.items()} | {"name": str}
     known = ", ".join(f"{option}=<{hint.__name__}>" for option, hint in sorted(choices.items()))
     options: dict[str, Any] = {}
-    for item in filter(None, text.split(",")):
+    for item in _split_options(text):
         key, equals, value = item.partition("=")
         if not equals or key not in choices:
             raise ValueError(f"Solver {name!r} has no option {item!r}; its options are: {known}.")
         if key in options:
             raise ValueError(f"Solver {name!r} is given the option {key!r} twice.")
         options[key] = _parse_value(f"Option {item!r} of solver {name!r}", value, choices[key])
-    # How it is called is no argument of the solver.
+    # The label is no argument of the solver.
     options.pop("name", None)
     options = {key: value for key, value in defaults.items() if key in parameters} | options
     missing = [key for key, parameter in parameters.items() if parameter.default is parameter.empty and key not in options]
@@ -110,7 +141,7 @@ def _plain_type(hint: Any) -> type:
 
 def _parse_value(what: str, value: str, kind: type) -> Any:
     """
-    :param what: What the value is, named in errors
+    :param what: Description of the value, for errors
     :param value: The text
     :param kind: ``int``, ``float``, ``bool`` or ``str``
     :raises ValueError: If the text is not of that type

@@ -26,7 +26,10 @@ class Block(NamedTuple):
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Block]) -> Block:
-        """:param blocks: Of different instances with equally many UAVs, each with equally many schedules"""
+        """
+        :param blocks: Blocks of different instances with the same number of UAVs and of schedules
+        :return: One block of all instances
+        """
         n_steps = max(block.tours.shape[-1] for block in blocks)
         padded = [functional.pad(block.tours, (0, n_steps - block.tours.shape[-1]), value=-1) for block in blocks]
         return cls(th.cat([block.value for block in blocks]), th.cat(padded))
@@ -54,11 +57,11 @@ class Shortlists:
                 if objective <= worst or len(new) == self.length:
                     break
                 new.setdefault(schedules(tours[place, None])[0], objective)
-            # This sort is stable too: of equal ones, those that were there before stay.
+            # A stable sort: among equal schedules, earlier ones stay.
             best = sorted((found | new).items(), key=lambda item: -item[1])
             found.clear()
             found.update(best[: self.length])
 
     def schedules(self) -> list[list[Schedule]]:
-        """:return: For each instance, the best first"""
+        """:return: The shortlist of each instance, the best first"""
         return [list(found) for found in self._found]

@@ -1,4 +1,4 @@
-"""Solvers that cannot be made here, and what stands for them in an evaluation."""
+"""Solvers that cannot be made, and their placeholder in an evaluation."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from sb3_uav.solvers.registry import solver_factory, solver_label
 
 
 class UnavailableError(ValueError):
-    """A solver that cannot be made here or in this time, though its options are right; others may be."""
+    """A solver that cannot be made here or within this time, although its options are right."""
 
 
 class UnavailableSolver(Solver):
     """
-    Stands for a solver that could not be made, so that the evaluation of the others says so.
+    Placeholder for a solver that could not be made: the evaluation records a failure for each instance.
 
-    It has the name of that solver, and as far as is known its use of time limits, so that earlier results of that solver are
-    found and later ones take the place of the failures.
+    It has the name of that solver and, as far as is known, its use of time limits, so that earlier results of the solver are
+    found and later ones replace the failures.
 
-    :param spec: The text that it should have been made from
-    :param reason: Why it could not be
+    :param spec: The text that the solver should have been made from
+    :param reason: Why it could not be made
     """
 
     def __init__(self, spec: str, reason: str) -> None:
@@ -27,9 +27,13 @@ class UnavailableSolver(Solver):
         self.reason = reason
         try:
             self.uses_time_limit = getattr(solver_factory(spec), "uses_time_limit", True)
-        except ImportError:
-            # Not even its class is known.
+        except (ImportError, ValueError):
+            # The class is unknown.
             self.uses_time_limit = True
+
+    def settings(self) -> None:
+        """There are no results."""
+        return None
 
     def check(self, instances: Instances) -> None:
         raise ValueError(self.reason)

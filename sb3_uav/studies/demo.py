@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from sb3_uav.common.random_streams import TEST_SEED
+from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
 from sb3_uav.envs import TaskAllocationEnv
 from sb3_uav.evaluation import evaluate, print_table
 from sb3_uav.evaluation.results import RESULTS_FILE
@@ -34,7 +34,7 @@ def newest_run(folder: Path, env_id: str) -> Path:
 
 def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int) -> int:
     """
-    Evaluate what a training run left beside heuristics, print the table and draw the figures.
+    Evaluate a trained pair beside heuristics, print the table and draw the figures.
 
     :param run: rl_zoo3's folder of the run
     :param env_id: Id of its environment
@@ -45,7 +45,7 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     """
     environment = gym.make(env_id).unwrapped
     assert isinstance(environment, TaskAllocationEnv)
-    instances = environment.problem.generator(n_instances, np.random.default_rng(TEST_SEED))
+    instances = environment.problem.generator(n_instances, keyed_generator(TEST_SEED))
     instances.save(out / "instances.npz")
 
     allocator = load_policy(run / f"{env_id}.zip", expected=AllocatorPolicy)
@@ -56,10 +56,10 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     print(f"\nEvaluating on {n_instances} new instances of {env_id}; every schedule is checked.")
     summary = evaluate(solvers, {env_id: instances}, out / "results", seed)
     print_table(summary)
-    print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
+    _print_gains(out / "results" / RESULTS_FILE, [greedy.name, sampling.name], [solver.name for solver in heuristics])
 
     plot_learning_curves(run / LOG_FILE, out / "learning_curves.png")
-    # The one whose depot lies most centrally shows most of what a fleet can do.
+    # The instance with the most central depot shows the tours best.
     row = int((instances.depot - 0.5).norm(dim=1).argmin())
     panels = []
     for solver in (sampling, heuristics[0]):
@@ -80,9 +80,9 @@ def evaluate_run(run: Path, env_id: str, out: Path, n_instances: int, seed: int)
     return int(any(row.violations for row in summary))
 
 
-def print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
+def _print_gains(results: Path, ours: Sequence[str], others: Sequence[str]) -> None:
     """
-    Print by how much we are better than others, instance by instance.
+    Print the mean paired difference between our solvers and others.
 
     :param results: The ``results.csv`` of an evaluation
     :param ours: Names of the solvers to compare

@@ -10,8 +10,9 @@ from typing import Any
 
 from sb3_uav.training.algorithms import import_object
 
-# Where the function stood in earlier versions, as YAML files and their users know it.
-_IMITATION_PATHS = ("sb3_uav.training.imitation.imitate", "sb3_uav.solvers.imitation.imitate")
+_IMITATION_PATH = "sb3_uav.training.imitation.imitate"
+# The end of that path in every version; YAML files of 0.1.0 name another package.
+_IMITATION_SUFFIX = ".imitation.imitate"
 
 
 class WarmStart:
@@ -31,10 +32,10 @@ class WarmStart:
         paths = [key for key in given if "." in str(key)]
         if len(paths) > 1 or (paths and len(given) > 1):
             raise ValueError(f"warm_start must map the dotted path of one function to its arguments, found {given!r:.80}.")
-        self.path: str = paths[0] if paths else _IMITATION_PATHS[0]
+        self.path: str = paths[0] if paths else _IMITATION_PATH
         arguments = given[self.path] if paths else given
-        if self.path in _IMITATION_PATHS:
-            self.path = _IMITATION_PATHS[0]
+        if self.path.startswith("sb3_uav.") and self.path.endswith(_IMITATION_SUFFIX):
+            self.path = _IMITATION_PATH
         if arguments is not None and not isinstance(arguments, dict):
             raise ValueError(f"warm_start: the arguments of {self.path} must be a mapping, found {arguments!r:.80}.")
         self.arguments: dict[str, Any] = dict(arguments or {})

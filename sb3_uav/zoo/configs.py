@@ -1,4 +1,4 @@
-"""The zoo's YAML files: where they are, and what may stand in an entry."""
+"""The zoo's YAML files: finding, reading and checking them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from stable_baselines3.common.utils import LinearSchedule
 import sb3_uav
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
 
-# What rl_zoo3 takes out of a YAML entry before the rest goes to the algorithm (rl_zoo3/exp_manager.py).
-ZOO_KEYS = {
+# Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
+_ZOO_KEYS = {
     "n_envs",
     "n_timesteps",
     "normalize",
@@ -30,22 +30,40 @@ ZOO_KEYS = {
 }
 
 
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """
+    :param path: A YAML file
+    :return: The mapping in it
+    :raises FileNotFoundError: If there is no such file
+    :raises ValueError: If it cannot be read, or holds no mapping; the message names the file
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file.")
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    # ValueError: bytes that are no UTF-8, and dates that do not exist. RecursionError: brackets without end.
+    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read as YAML: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: holds {_kind(found)} instead of a mapping; write `name: settings`.")
+    return found
+
+
+def _kind(value: Any) -> str:
+    return "nothing" if value is None else f"{value!r:.40} ({type(value).__name__})"
+
+
 def default_config(algo: str, env_id: str | None = None) -> Path | None:
     """
     :param algo: Name of an algorithm
-    :param env_id: What to train on
+    :param env_id: Id of an environment
     :return: Our YAML for it, from the installed package or from the source checkout; None if we ship none, or if rl_zoo3 has
-        one and ours does not know this environment
+        one and ours has no entry for this environment
     """
     package = Path(sb3_uav.__file__).parent
     candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
     ours = next((path for path in candidates if path.is_file()), None)
-    if (
-        ours is not None
-        and env_id is not None
-        and stock_config(algo).is_file()
-        and env_id not in yaml.safe_load(ours.read_text())
-    ):
+    if ours is not None and env_id is not None and stock_config(algo).is_file() and env_id not in read_yaml(ours):
         return None
     return ours
 
@@ -53,7 +71,7 @@ def default_config(algo: str, env_id: str | None = None) -> Path | None:
 def plain_numbers(value: Any) -> Any:
     """
     :param value: From a YAML file
-    :return: The same with numbers for texts such as ``1e-3``, which YAML 1.1 does not take for numbers
+    :return: The value with numbers in place of strings such as ``1e-3``, which YAML 1.1 reads as strings
     """
     if isinstance(value, dict):
         return {key: plain_numbers(item) for key, item in value.items()}
@@ -68,15 +86,44 @@ def plain_numbers(value: Any) -> Any:
 def check_keys(found: set[str], algorithm: type, where: str) -> None:
     """
     :param found: Keys of a YAML entry
-    :param algorithm: The class that gets what rl_zoo3 does not take
+    :param algorithm: The class that receives the keys that rl_zoo3 does not use
     :param where: File and entry, named in the error
-    :raises ValueError: On a key that neither knows
+    :raises ValueError: If neither uses a key
     """
-    known = ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
-    for key in sorted(found - known):
-        nearest = difflib.get_close_matches(key, known, n=1)
+    known = _ZOO_KEYS | set(inspect.signature(algorithm).parameters) - {"_init_setup_model", "env"}
+    for key in sorted(found - known, key=str):
+        nearest = difflib.get_close_matches(str(key), known, n=1)
         advice = f"did you mean {nearest[0]!r}?" if nearest else f"known keys: {', '.join(sorted(known))}."
         raise ValueError(f"{where}: unknown key {key!r}; {advice}")
+
+
+def check_values(entry: dict[str, Any], where: str) -> None:
+    """
+    Check values that would make rl_zoo3 fail without naming the key.
+
+    :param entry: A YAML entry
+    :param where: File and entry, named in the error
+    :raises ValueError: If a value is of the wrong kind
+    """
+    for key in ("n_envs", "n_timesteps"):
+        value = entry.get(key, 1)
+        whole = isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer()
+        if not whole or value < 1:
+            raise ValueError(f"{where}: {key} is {_kind(value)}; write a whole number, at least 1.")
+    if not isinstance(entry.get("policy"), str):
+        raise ValueError(f"{where}: policy is {_kind(entry.get('policy'))}; write the name of a policy.")
+    for key in ("policy_kwargs", "env_kwargs", "monitor_kwargs"):
+        value = entry.get(key)
+        # rl_zoo3 evaluates strings such as "dict(net_arch=[64])".
+        if not (value is None or isinstance(value, dict) or (isinstance(value, str) and re.match(r"\s*(dict\(|\{)", value))):
+            raise ValueError(f"{where}: {key} is {_kind(value)}; write a mapping.")
+    callbacks = entry.get("callback") or []
+    for callback in callbacks if isinstance(callbacks, list) else [callbacks]:
+        if not isinstance(callback, str) and not (isinstance(callback, dict) and len(callback) == 1):
+            raise ValueError(f"{where}: callback holds {_kind(callback)}; write a dotted name, or one with its arguments.")
+        for arguments in callback.values() if isinstance(callback, dict) else ():
+            if not isinstance(arguments, dict):
+                raise ValueError(f"{where}: the arguments of a callback are {_kind(arguments)}; write a mapping.")
 
 
 def parse_schedule(key: str, text: str) -> float | LinearSchedule:

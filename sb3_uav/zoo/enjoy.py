@@ -12,6 +12,7 @@ from typing import Any
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
+from sb3_uav.zoo.dependencies import require_zoo
 
 PROG = "sb3-uav enjoy"
 
@@ -25,6 +26,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that replays need is not installed
     """
+    require_zoo("Replaying a trained agent", "rl_zoo3.enjoy")
     from sb3_uav.zoo.experiment import make_batched_vec_env, register_algorithms
     from sb3_uav.zoo.rl_zoo3_compat import command_line, default_vec_env, replay_environment
 
@@ -56,14 +58,14 @@ def enjoy(arguments: Sequence[str]) -> None:
         with default_vec_env(make_batched_vec_env), replay_environment(make_env), command_line(PROG, flags):
             rl_zoo3.enjoy.enjoy()
     except AssertionError as error:
-        # What rl_zoo3 raises for a missing folder.
+        # rl_zoo3 raises it for a missing folder.
         raise ValueError(str(error)) from error
 
 
 def find_router(run_folder: Path, best: bool) -> Path | None:
     """
-    :param run_folder: Where the allocator's zip lies
-    :param best: Whether the router of the best allocator is wanted
+    :param run_folder: Folder of the allocator's zip
+    :param best: Whether to return the router of the best allocator
     :return: The router's zip, if the run has one
     """
     from sb3_uav.training.best_pair import find_best_router
@@ -74,13 +76,13 @@ def find_router(run_folder: Path, best: bool) -> Path | None:
 
 
 def _create_test_env(create_test_env: Any, model: str | None, router: Path | None, env_id: str, **kwargs: Any) -> Any:
-    """``rl_zoo3.utils.create_test_env``, handing the router and the allocator's order of tasks to the environment."""
+    """``rl_zoo3.utils.create_test_env``, passing the router and the allocator's order of tasks to the environment."""
     from sb3_uav.policies import AllocatorPolicy, RouterPolicy
     from sb3_uav.policies.loading import load_policy
 
     env = create_test_env(env_id, **kwargs)
     if model is not None and env.has_attr("set_task_order"):
-        # A stock policy has no order of its own.
+        # Stock policies define no order.
         with suppress(ValueError):
             env.env_method("set_task_order", load_policy(model, "cpu", AllocatorPolicy).env_order)
     if router is not None and env.has_attr("set_router"):

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import yaml
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -18,10 +17,15 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
-from sb3_uav.zoo.configs import check_keys, parse_schedule, plain_numbers
+from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
+# Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
+_SETUP_ERRORS = (
+    *(TypeError, AttributeError, AssertionError, ModuleNotFoundError, NameError, SyntaxError, LookupError, ArithmeticError),
+    *(RuntimeError, MemoryError),
+)
 OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
 
 
@@ -56,8 +60,8 @@ class UAVExperimentManager(ExperimentManager):
       that diverges, however it does.
     """
 
-    # Whether the command line says how often to evaluate; if not, FixedSetEvalCallback decides, and without it, it is done
-    # once per epoch where there are epochs.
+    # Whether --eval-freq was given. If not, FixedSetEvalCallback determines the frequency; without it, evaluations take place
+    # once per epoch.
     eval_freq_given = False
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
@@ -66,21 +70,38 @@ class UAVExperimentManager(ExperimentManager):
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
         register_search_spaces(self.env_name.gym_id)
 
+    @property
+    def _where(self) -> str:
+        """File and entry, as errors name them."""
+        return f"{self.config}, {self.env_name.gym_id}"
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        try:
-            hyperparams, saved = super().read_hyperparameters()
-        except (yaml.YAMLError, FileNotFoundError) as error:
-            raise ValueError(f"{self.config}: cannot be read: {error}") from error
+        if str(self.config).endswith((".yml", ".yaml")):
+            read_yaml(Path(self.config))
+        hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
-        check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], f"{self.config}, {self.env_name.gym_id}")
-        return {key: plain_numbers(value) for key, value in hyperparams.items()}, saved
+        check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
+        hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
+        check_values(hyperparams, self._where)
+        return hyperparams, saved
 
     def setup_experiment(self) -> Any:
         try:
             return super().setup_experiment()
-        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
-            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+        except _SETUP_ERRORS as error:
+            raise ValueError(f"{self._where}: {_described(error)}") from error
+        except ValueError as error:
+            if str(self.config) in str(error):
+                raise
+            raise ValueError(f"{self._where}: {error}") from error
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        try:
+            super().learn(model)
+        except (TypeError, OverflowError) as error:
+            # Some values are first used in training.
+            raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         env = super().create_envs(n_envs, eval_env, no_log)
@@ -92,7 +113,9 @@ class UAVExperimentManager(ExperimentManager):
         try:
             processed = super()._preprocess_hyperparams(hyperparams)
         except TypeError as error:
-            raise ValueError(f"{self.config}: an argument of 'callback' does not fit: {error}") from error
+            raise ValueError(f"{self._where}: an argument of 'callback' does not fit: {error}") from error
+        if not isinstance(hyperparams.get("policy_kwargs") or {}, dict):
+            raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         if not self.eval_freq_given:
@@ -103,12 +126,12 @@ class UAVExperimentManager(ExperimentManager):
         """
         Evaluate as the YAML entry suggests.
 
-        :param hyperparams: Of the algorithm
-        :param callbacks: Those of the entry
+        :param hyperparams: Hyperparameters of the algorithm
+        :param callbacks: Callbacks of the entry
         """
         n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
         if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
-            # It does what rl_zoo3's EvalCallback would do, on more than a few random episodes.
+            # It replaces rl_zoo3's EvalCallback, with more than a few random episodes.
             self.eval_freq = -1
         elif n_tasks and "instances_per_epoch" in hyperparams:
             self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
@@ -126,12 +149,12 @@ class UAVExperimentManager(ExperimentManager):
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
                 if self.continue_training and callback.resume_from is None:
-                    callback.resume_from = find_checkpoint(Path(self.trained_agent))
+                    callback.resume_from = _find_checkpoint(Path(self.trained_agent))
 
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
-        kept = [entry for entry in (given if isinstance(given, list) else [given]) if not is_fixed_set_evaluation(entry)]
-        # By name, so that every trial gets an instance of its own.
+        kept = [entry for entry in (given if isinstance(given, list) else [given]) if not _is_fixed_set_evaluation(entry)]
+        # By name, so that every trial gets its own instance.
         self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
         try:
             super().hyperparameters_optimization()
@@ -144,10 +167,10 @@ class UAVExperimentManager(ExperimentManager):
         try:
             mean_reward = super().objective(trial)
         except (RuntimeError, FloatingPointError) as error:
-            # rl_zoo3 takes ValueError and AssertionError in training for divergence; torch also raises these.
+            # rl_zoo3 treats ValueError and AssertionError in training as divergence; torch raises these errors too.
             raise optuna.exceptions.TrialPruned(str(error)) from error
-        except (TypeError, AttributeError, AssertionError, ModuleNotFoundError) as error:
-            raise ValueError(f"{self.config}, {self.env_name.gym_id}: {error}") from error
+        except _SETUP_ERRORS as error:
+            raise ValueError(f"{self._where}: {_described(error)}") from error
         if not math.isfinite(mean_reward):
             raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
         return mean_reward
@@ -159,18 +182,23 @@ class UAVExperimentManager(ExperimentManager):
         return found[0] if found else None
 
 
-def is_fixed_set_evaluation(entry: Any) -> bool:
+def _described(error: Exception) -> str:
+    """The message of an error, with its type where the text alone is unclear."""
+    return str(error) if isinstance(error, TypeError | AssertionError | ImportError) else f"{type(error).__name__}: {error}"
+
+
+def _is_fixed_set_evaluation(entry: Any) -> bool:
     """
-    :param entry: Of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
-    :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which a trial has no use for
+    :param entry: An item of a YAML's ``callback`` list: a dotted name, or a mapping from it to arguments
+    :return: Whether it is a :class:`~sb3_uav.training.FixedSetEvalCallback`, which trials do not need
     """
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
 
 
-def find_checkpoint(trained_agent: Path) -> Path:
+def _find_checkpoint(trained_agent: Path) -> Path:
     """
-    :param trained_agent: The allocator's zip to go on from
+    :param trained_agent: The allocator's zip to resume from
     :return: The folder with the state of its interactive training
     :raises FileNotFoundError: If there is none; the message names the zip to use if there is one near
     """
@@ -179,4 +207,4 @@ def find_checkpoint(trained_agent: Path) -> Path:
         return beside
     if (below / STATE_FILE).is_file():
         return below
-    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which knows its router.")
+    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which names its router.")

@@ -1,7 +1,7 @@
 """
-Every place where we change rl_zoo3 from outside, each with the line of rl_zoo3 that makes it necessary.
+Every change that we make to rl_zoo3 from outside, with a link to the code that makes it necessary.
 
-What we override in a subclass of its ``ExperimentManager`` stands in :mod:`sb3_uav.zoo.experiment`.
+Overridden methods of its ``ExperimentManager`` are in :mod:`sb3_uav.zoo.experiment`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sb3_uav.common.optional import install_command
+
 try:
     import optuna  # noqa: F401  (rl_zoo3 imports it; a missing one is reported here too)
     import rl_zoo3
@@ -19,12 +21,12 @@ try:
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 except ImportError as error:
-    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: pip install 'sb3-uav[zoo]'") from error
+    raise ImportError(f"Training from YAML needs rl_zoo3 ({error}); run: {install_command('zoo')}") from error
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-MakeVecEnv = Callable[[list[Any]], VecEnv]
+_MakeVecEnv = Callable[[list[Any]], VecEnv]
 
 
 @contextmanager
@@ -45,7 +47,7 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 @contextmanager
 def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
     """
-    Set what ``rl_zoo3.train`` and ``rl_zoo3.enjoy`` parse, which take no arguments.
+    Set the command line that ``rl_zoo3.train`` and ``rl_zoo3.enjoy`` parse, because they take no arguments.
 
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``parser.parse_args()``)
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (the same)
@@ -60,7 +62,7 @@ def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
 @contextmanager
 def experiment_manager(manager: type[ExperimentManager]) -> Iterator[None]:
     """
-    Let ``rl_zoo3.train`` use another class, which it finds by this name in its module.
+    Replace the experiment manager that ``rl_zoo3.train`` looks up in its module.
 
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``exp_manager = ExperimentManager(``)
 
@@ -73,7 +75,7 @@ def experiment_manager(manager: type[ExperimentManager]) -> Iterator[None]:
 @contextmanager
 def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
     """
-    Let ``rl_zoo3.enjoy`` make its environment by another function, which it finds by this name in its module.
+    Replace the function that ``rl_zoo3.enjoy`` looks up in its module to make its environment.
 
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (``env = create_test_env(``)
 
@@ -86,9 +88,9 @@ def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
 
 
 @contextmanager
-def default_vec_env(make: MakeVecEnv) -> Iterator[None]:
+def default_vec_env(make: _MakeVecEnv) -> Iterator[None]:
     """
-    Let rl_zoo3 vectorize environments by another function while the ``with`` block lasts.
+    Replace rl_zoo3's default vectorized environment while the ``with`` block lasts.
 
     :param make: Takes one function per row
     """
@@ -97,9 +99,9 @@ def default_vec_env(make: MakeVecEnv) -> Iterator[None]:
         yield
 
 
-def set_default_vec_env(make: MakeVecEnv) -> None:
+def set_default_vec_env(make: _MakeVecEnv) -> None:
     """
-    Let rl_zoo3 vectorize environments by another function from now on.
+    Replace rl_zoo3's default vectorized environment.
 
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/exp_manager.py (``default_vec_env_cls``)
 
@@ -121,13 +123,13 @@ def add_algorithms(algorithms: dict[str, type[BaseAlgorithm]]) -> None:
 
 def set_search_space(algo: str, sampler: Callable[..., Any], converter: Callable[..., Any]) -> None:
     """
-    Let ``-optimize`` search another space from now on.
+    Replace the search space of ``-optimize``.
 
     https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/hyperparams_opt.py (``HYPERPARAMS_SAMPLER``)
 
     :param algo: Name of an algorithm
     :param sampler: Draws hyperparameters
-    :param converter: Converts what a trial drew
+    :param converter: Converts the parameters of a trial
     """
     samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
     converters: dict[str, Any] = HYPERPARAMS_CONVERTER
@@ -139,6 +141,6 @@ def stock_config(algo: str) -> Path:
     https://github.com/DLR-RM/rl-baselines3-zoo/tree/master/hyperparams
 
     :param algo: Name of an algorithm
-    :return: Where rl_zoo3 has its YAML, if it has one
+    :return: Path of rl_zoo3's YAML for it, which need not exist
     """
     return Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"

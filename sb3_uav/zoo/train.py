@@ -9,6 +9,7 @@ from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
+from sb3_uav.zoo.dependencies import require_zoo
 
 PROG = "sb3-uav train"
 
@@ -22,18 +23,25 @@ def train(arguments: Sequence[str]) -> None:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that training needs is not installed
     """
-    from sb3_uav.zoo.configs import default_config
-    from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
-    from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, rl_zoo3
-
-    register_algorithms()
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="reinforce")
     parser.add_argument("--env")
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("--eval-freq")
     parser.add_argument("-i", "--trained-agent")
+    parser.add_argument("-tb", "--tensorboard-log")
+    parser.add_argument("-P", "--progress", action="store_true")
     known, _ = parser.parse_known_args(arguments)
+    require_zoo("Training from YAML")
+    if known.progress:
+        require_zoo("The progress bar", "tqdm.rich", "rich")
+    if known.tensorboard_log:
+        require_zoo("--tensorboard-log", "tensorboard")
+    from sb3_uav.zoo.configs import default_config
+    from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
+    from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, rl_zoo3
+
+    register_algorithms()
     if known.trained_agent is not None and not Path(known.trained_agent).is_file():
         raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
@@ -43,6 +51,9 @@ def train(arguments: Sequence[str]) -> None:
     with experiment_manager(UAVExperimentManager), command_line(PROG, ["--algo", known.algo, *defaults, *arguments]):
         try:
             rl_zoo3.train.train()
+        except AssertionError as error:
+            # rl_zoo3 raises it for wrong arguments.
+            raise ValueError(str(error)) from error
         except FileNotFoundError:
             raise
         except OSError as error:

@@ -4,7 +4,7 @@ Search spaces of ``-optimize`` for our environments, in rl_zoo3's form: a sample
 rl_zoo3's own spaces for on-policy algorithms replace the network's arguments, discount rewards, and cut episodes anywhere.
 Ours leave to the YAML entry
 
-- the network (``policy`` and ``policy_kwargs``), because no trial sees what a larger one costs in time;
+- the network (``policy`` and ``policy_kwargs``), because trials do not measure the time that a larger one costs;
 - the discount ``gamma``, which is 1 in ours: a task visited late counts as much as one visited early;
 - the rollout (``n_envs`` and ``n_steps``), which holds whole episodes in ours;
 - the router under ``ITSCallback``; tune it on a ``RoutePlanning`` environment.
@@ -43,14 +43,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.zoo.rl_zoo3_compat import set_search_space
 
-Params = dict[str, Any]
-Converter = Callable[[Params], Params]
-# Of the trial (optuna.Trial), the number of actions (for noise), n_envs and what off-policy algorithms need.
-Sampler = Callable[[Any, int, int, Params], Params]
+_Params = dict[str, Any]
+_Converter = Callable[[_Params], _Params]
+# Takes the trial (optuna.Trial), the number of actions (for noise), n_envs and arguments for off-policy algorithms.
+_Sampler = Callable[[Any, int, int, _Params], _Params]
 
 
-def suggest_common(trial: Any) -> Params:
-    """:param trial: Draws what every algorithm has"""
+def _suggest_common(trial: Any) -> _Params:
+    """:param trial: Draws the hyperparameters that all algorithms share"""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 5e-3, log=True),
         "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 5.0, log=True),
@@ -58,45 +58,45 @@ def suggest_common(trial: Any) -> Params:
     }
 
 
-def suggest_critic(trial: Any) -> Params:
-    """:param trial: Draws what algorithms with a critic have"""
+def _suggest_critic(trial: Any) -> _Params:
+    """:param trial: Draws the hyperparameters of algorithms with a critic"""
     return {
         "gae_lambda": trial.suggest_categorical("gae_lambda", [0.9, 0.95, 0.98, 0.99, 1.0]),
         "vf_coef": trial.suggest_float("vf_coef", 1e-3, 1.0, log=True),
     }
 
 
-def sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_ppo(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """PPO and MaskablePPO on our environments; parameters and result as in rl_zoo3."""
-    hyperparams = convert_powers(
+    hyperparams = _convert_powers(
         {
-            **suggest_common(trial),
-            **suggest_critic(trial),
+            **_suggest_common(trial),
+            **_suggest_critic(trial),
             "batch_size_pow": trial.suggest_int("batch_size_pow", 8, 13),
             "n_epochs": trial.suggest_int("n_epochs", 1, 8),
             "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
         }
     )
-    # As rl_zoo3 does, so that reports show the number itself too.
+    # As in rl_zoo3, so that reports also show the number itself.
     trial.set_user_attr("batch_size", hyperparams["batch_size"])
     return hyperparams
 
 
-def sample_a2c(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_a2c(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """A2C on our environments; parameters and result as in rl_zoo3."""
     return {
-        **suggest_common(trial),
-        **suggest_critic(trial),
+        **_suggest_common(trial),
+        **_suggest_critic(trial),
         "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
         "use_rms_prop": trial.suggest_categorical("use_rms_prop", [False, True]),
     }
 
 
-def sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """REINFORCE on our environments, playing whole episodes; parameters and result as in rl_zoo3."""
-    return convert_reinforce(
+    return _convert_reinforce(
         {
-            **suggest_common(trial),
+            **_suggest_common(trial),
             "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
             "baseline": trial.suggest_categorical("baseline", ["shared", "rollout", "critic"]),
             "n_samples_pow": trial.suggest_int("n_samples_pow", 1, 4),
@@ -104,11 +104,11 @@ def sample_reinforce(trial: Any, n_actions: int, n_envs: int, additional_args: P
     )
 
 
-def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+def _sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_args: _Params) -> _Params:
     """REINFORCE on any other environment, in SB3's loop; parameters and result as in rl_zoo3."""
-    return convert_reinforce(
+    return _convert_reinforce(
         {
-            **suggest_common(trial),
+            **_suggest_common(trial),
             "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.03, log=True),
             "n_steps_pow": trial.suggest_int("n_steps_pow", 6, 11),
             "normalize_advantage": trial.suggest_categorical("normalize_advantage", [False, True]),
@@ -117,12 +117,12 @@ def sample_reinforce_steps(trial: Any, n_actions: int, n_envs: int, additional_a
     )
 
 
-def convert_powers(params: Params) -> Params:
+def _convert_powers(params: _Params) -> _Params:
     """
-    :param params: What a trial drew
+    :param params: Parameters of a trial
     :return: Hyperparameters: ``x_pow`` is the binary logarithm of ``x``, ``one_minus_x`` is 1 - ``x``
     """
-    converted: Params = {}
+    converted: _Params = {}
     for name, value in params.items():
         if name.endswith("_pow"):
             converted[name.removesuffix("_pow")] = 2**value
@@ -133,22 +133,22 @@ def convert_powers(params: Params) -> Params:
     return converted
 
 
-def convert_reinforce(params: Params) -> Params:
+def _convert_reinforce(params: _Params) -> _Params:
     """
-    :param params: What a trial of REINFORCE drew
-    :return: Hyperparameters; arguments of the YAML's baseline do not go with another one
+    :param params: Parameters of a REINFORCE trial
+    :return: Hyperparameters; the YAML's baseline arguments are dropped, because they do not fit other baselines
     """
-    return {**convert_powers(params), "baseline_kwargs": None}
+    return {**_convert_powers(params), "baseline_kwargs": None}
 
 
-OUR_SPACES: dict[str, tuple[Sampler, Converter]] = {
-    "reinforce": (sample_reinforce, convert_reinforce),
-    "ppo": (sample_ppo, convert_powers),
-    "ppo_mask": (sample_ppo, convert_powers),
-    "a2c": (sample_a2c, convert_powers),
+OUR_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+    "reinforce": (_sample_reinforce, _convert_reinforce),
+    "ppo": (_sample_ppo, _convert_powers),
+    "ppo_mask": (_sample_ppo, _convert_powers),
+    "a2c": (_sample_a2c, _convert_powers),
 }
-OTHER_SPACES: dict[str, tuple[Sampler, Converter]] = {
-    "reinforce": (sample_reinforce_steps, convert_reinforce),
+OTHER_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+    "reinforce": (_sample_reinforce_steps, _convert_reinforce),
     "ppo": (sample_ppo_params, convert_onpolicy_params),
     "ppo_mask": (sample_ppo_params, convert_onpolicy_params),
     "a2c": (sample_a2c_params, convert_onpolicy_params),
@@ -157,7 +157,7 @@ OTHER_SPACES: dict[str, tuple[Sampler, Converter]] = {
 
 def register_search_spaces(env_id: str) -> None:
     """
-    Let rl_zoo3 use the search spaces for this environment, from now on.
+    Register the search spaces for this environment with rl_zoo3.
 
     :param env_id: Id of a registered environment
     """
@@ -177,7 +177,7 @@ def is_ours(env_id: str) -> bool:
 
 class StopWhenDiverged(BaseCallback):
     """
-    Stops a training whose parameters are no longer finite, which the fused driver would not notice by itself.
+    Stops a training whose parameters are no longer finite, which the fused driver does not detect.
 
     :raises ValueError: At the start of a rollout; ``-optimize`` prunes a trial on it
     """

@@ -44,7 +44,7 @@ def make_validation_set(settings: Settings, problem: Any) -> None:
     Put the validation set into the folder, unless it is there.
 
     :param settings: Settings of the comparison
-    :param problem: Whose instances to draw
+    :param problem: The problem whose instances are drawn
     """
 
     path = settings.out / VALIDATION_FILE
@@ -90,11 +90,11 @@ def make_router(settings: Settings, problem: Any) -> None:
 
 def check_settings(settings: Settings, needs_router: bool) -> None:
     """
-    Make sure that all runs in the folder are trained and evaluated alike.
+    Check that earlier runs in the folder have the same settings.
 
     :param settings: Settings of the comparison
     :param needs_router: Whether the common router gives the rewards
-    :raises ValueError: If earlier runs were not
+    :raises ValueError: If they have other settings
     """
 
     now = {

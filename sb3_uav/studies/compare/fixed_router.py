@@ -1,4 +1,4 @@
-"""Training a router alone, as a fixed ground for comparing algorithms on the allocator."""
+"""Training a router alone, as the fixed basis for comparing algorithms on the allocator."""
 
 from __future__ import annotations
 
@@ -71,17 +71,17 @@ def pretrain_router(
     Train a router with REINFORCE and save it.
 
     :param generator: Draws the instances of the fleet
-    :param settings: What to change of :data:`RECIPE`
-    :param n_subsets: How many subsets to learn from
+    :param settings: Overrides of :data:`RECIPE`
+    :param n_subsets: Number of training subsets
     :param path: The zip to write
-    :param seed: Of the training
-    :param device: Where to train
-    :return: What was done, in words
+    :param seed: Seed of the training
+    :param device: Device of the training
+    :return: Description of the training, for the report
     :raises ValueError: If the settings do not fit REINFORCE
     """
     kwargs = {**RECIPE, **settings}
     if kwargs.pop("algo", "reinforce") != "reinforce":
-        raise ValueError(f"The router of {settings} is not trained by reinforce; train one and give it as --router.")
+        raise ValueError(f"The router of {settings} is not trained by reinforce; train a router and pass it as --router.")
     n_envs = kwargs.pop("n_envs")
     env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=DividedSubsets(generator))] * n_envs)
     try:

@@ -1,4 +1,4 @@
-"""What :mod:`sb3_uav.studies.compare.study` says about its runs: a CSV, a figure and a report in Markdown."""
+"""The results of a comparison: a CSV, figures and a report in Markdown."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ FIGURE_AXES = {
 FIGURE_FILES = ("comparison.png", "comparison.pdf")
 CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
 PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
-GRID_POINTS = 200
+_GRID_POINTS = 200
 
 
 class Run(NamedTuple):
     """
     One finished training.
 
-    :param variant: Name of what is compared
+    :param variant: Name of its variant
     :param algorithm: rl_zoo3's name of its algorithm
     :param seed: Its seed
     :param history: Its evaluations
@@ -53,7 +53,7 @@ class Run(NamedTuple):
 class Estimate(NamedTuple):
     """
     :param mean: The mean
-    :param half_width: Of its 95 % confidence interval; NaN for a single value
+    :param half_width: Half of its 95 % confidence interval; NaN for a single value
     """
 
     mean: float
@@ -88,10 +88,10 @@ class TableRow(NamedTuple):
     difference: Estimate
 
 
-def by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def _by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """
     :param runs: Runs
-    :return: The same by variant, in order of appearance
+    :return: The runs by variant, in order of appearance
     """
     return {name: [run for run in runs if run.variant == name] for name in dict.fromkeys(run.variant for run in runs)}
 
@@ -125,7 +125,7 @@ def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
     """
     :param runs: Finished runs
     :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
-    :param at: Where on that axis
+    :param at: Position on that axis
     :return: One row per variant, the best first
     """
     where = np.array([at])
@@ -135,7 +135,7 @@ def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
         values = values[:, None] if values.ndim == 1 else values
         return interpolate(getattr(run.history, axis), values, where)[0]
 
-    groups = by_variant(runs)
+    groups = _by_variant(runs)
     # (n_seeds, n_instances) each.
     greedy = {name: np.stack([of(run, "results") for run in group]) for name, group in groups.items()}
     best = max(greedy, key=lambda name: greedy[name].mean())
@@ -162,11 +162,11 @@ def compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Ban
     :param group: The runs of one variant
     :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
     :param field: ``"results"`` or ``"sampled"``
-    :param end: Where the curve ends at the latest; no later than the shortest run
+    :param end: Upper limit of the horizontal axis; the curve also ends with the shortest run
     :return: Mean over seeds and its confidence interval
     """
     last = min(float(getattr(run.history, axis)[-1]) for run in group)
-    grid = np.linspace(0.0, min(last, end), GRID_POINTS)
+    grid = np.linspace(0.0, min(last, end), _GRID_POINTS)
     curves = []
     for run in group:
         means = getattr(run.history, field).mean(1)
@@ -180,9 +180,9 @@ def draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None
     :param runs: Finished runs
     :param budget: Environment steps of each
     :param n_samples: Samples per instance
-    :param folder: Where to write the figures
+    :param folder: Output folder of the figures
     """
-    groups = by_variant(runs)
+    groups = _by_variant(runs)
     fields = {"results": "greedy"}
     if n_samples > 0:
         fields["sampled"] = f"best of {n_samples} samples"
@@ -216,9 +216,9 @@ def csv_text(runs: Sequence[Run]) -> str:
     return text.getvalue()
 
 
-def markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
+def _markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
     """
-    :param rows: The best first
+    :param rows: Rows, the best first
     :param n_samples: Samples per instance
     :return: A table
     """
@@ -237,7 +237,7 @@ def machine(n_threads: int, n_jobs: int, device: str) -> str:
     """
     :param n_threads: Threads of each training
     :param n_jobs: Trainings side by side
-    :param device: Where they ran
+    :param device: Device of the trainings
     :return: A line about the machine
     """
     processor = platform.processor() or platform.machine()
@@ -252,7 +252,7 @@ def machine(n_threads: int, n_jobs: int, device: str) -> str:
 
 
 def versions() -> str:
-    """:return: What the figures were made with"""
+    """:return: Versions of the packages that the figures were made with"""
     found = [f"sb3_uav {sb3_uav.__version__}", f"Python {platform.python_version()}"]
     for package in PACKAGES:
         try:
@@ -275,12 +275,12 @@ def write_results(
     Write the CSV, the figures and the report.
 
     :param runs: Finished runs, at least one
-    :param folder: Where to
+    :param folder: Output folder
     :param title: Title of the report
     :param budget: Environment steps of each run
     :param n_samples: Samples per instance
-    :param notes: How it was done, a line each
-    :param commands: What each command does, and the command
+    :param notes: Notes on the procedure, one line each
+    :param commands: The commands by description
     """
     write_atomically(folder / CSV_FILE, csv_text(runs))
     draw(runs, budget, n_samples, folder)
@@ -296,27 +296,27 @@ def write_results(
         "",
         f"## At equal environment steps: {budget:,}",
         "",
-        markdown_table(compute_table(runs, "timesteps", budget), n_samples),
+        _markdown_table(compute_table(runs, "timesteps", budget), n_samples),
         "",
         f"## At equal wall time: {wall:,.1f} s of training",
         "",
         "The time of the fastest run.",
         "",
-        markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
+        _markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
         "",
         f"## At equal CPU time: {cpu:,.1f} s of training",
         "",
-        "Other work on the machine lengthens wall time, from run to run by another factor; it hardly changes CPU time.",
+        "Other processes on the machine lengthen wall time, by a different factor in each run; they hardly change CPU time.",
         "",
-        markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
+        _markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
         "",
         "## How to read this",
         "",
         "Objectives: mean over the validation instances, and the 95 % confidence interval over training seeds (Student's t).",
         "Last column: a variant's greedy objective (mean over its seeds) minus that of the best variant, paired instance by",
         "instance, and the 95 % confidence interval over instances. Values between two evaluations are interpolated.",
-        "Seconds are wall time of learning alone: evaluations, saving and the start of the process are left out. Greedy",
-        "episodes of the rollout baseline take time but are no environment steps.",
+        "Seconds are wall time of learning alone, without evaluations, saving and the start of the process. Greedy",
+        "episodes of the rollout baseline take time but do not count as environment steps.",
         "",
         "## Commands",
         "",

@@ -1,4 +1,4 @@
-"""Running trainings of the zoo in processes of their own, so that finished ones are never repeated."""
+"""Running trainings of the zoo in separate processes, so that finished ones are never repeated."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class ZooTraining(NamedTuple):
     """
     One run.
 
-    :param name: What it trains
+    :param name: Name of the variant
     :param algo: rl_zoo3's name of the algorithm
     :param env_id: Id of the environment
     :param seed: The seed
-    :param n_timesteps: Environment steps that it is going to take at least
+    :param n_timesteps: Minimum number of environment steps
     :param config: The YAML
-    :param folder: Folder of everything that it writes
+    :param folder: Output folder
     :param n_threads: Number of threads
-    :param device: Where to train
+    :param device: Device of the training
     """
 
     name: str
@@ -49,7 +49,7 @@ class ZooTraining(NamedTuple):
 
     @property
     def flags(self) -> list[str]:
-        """What follows ``python``."""
+        """Command line arguments after ``python``."""
         flags = ["-m", "sb3_uav.zoo.train", "--algo", self.algo, "--env", self.env_id, "--conf-file", str(self.config)]
         flags += ["--log-folder", str(self.folder), "--seed", str(self.seed), "--eval-freq", "-1", "--log-interval", "-2"]
         return [*flags, "--num-threads", str(self.n_threads), "--device", self.device]
@@ -61,21 +61,21 @@ class ZooTraining(NamedTuple):
     @property
     def history(self) -> EvaluationHistory:
         """
-        What FixedSetEvalCallback left.
+        The evaluations that FixedSetEvalCallback wrote.
 
-        :raises FileNotFoundError: If it left nothing
+        :raises FileNotFoundError: If there are none
         """
         return EvaluationHistory.load(self.folder / self.algo / f"{self.env_id}_1" / RESULTS_FILE)
 
     def start(self) -> subprocess.Popen[bytes]:
         """:return: The process of this training"""
         if self.folder.exists():
-            # An interrupted run: half a curve is worth nothing in a comparison.
+            # An interrupted run: half a curve is of no use in a comparison.
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True)
         environment = {**os.environ, "OMP_NUM_THREADS": str(self.n_threads)}
         with (self.folder / LOG_FILE).open("wb") as log:
-            # In a session of its own, because rl_zoo3 takes Ctrl-C for an orderly end.
+            # In its own session, because rl_zoo3 treats Ctrl-C as a normal end of training.
             return subprocess.Popen(
                 [sys.executable, *self.flags],
                 stdout=log,
@@ -88,9 +88,9 @@ class ZooTraining(NamedTuple):
         """
         Mark this run as finished, if it is.
 
-        :param exit_code: Of its process
+        :param exit_code: Exit code of its process
         :param seconds: Wall time of its process
-        :return: Otherwise what went wrong
+        :return: What went wrong, or None if the run is complete
         """
         log = self.folder / LOG_FILE
         if exit_code != 0:
@@ -109,16 +109,16 @@ class ZooTraining(NamedTuple):
 
 def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
     """
-    Run trainings side by side. Whatever ends this function early ends its processes too.
+    Run trainings side by side. If this function ends early, its processes end too.
 
     :param trainings: What to run, in this order
-    :param n_jobs: How many at once
-    :raises ValueError: If some failed, after all others are through
+    :param n_jobs: Number of trainings at once
+    :raises ValueError: If some failed; raised after all others have finished
     """
     waiting = list(trainings)
     running: list[tuple[ZooTraining, subprocess.Popen[bytes], float]] = []
     failures: list[str] = []
-    with termination_as_interrupt():
+    with _termination_as_interrupt():
         try:
             while waiting or running:
                 while waiting and len(running) < n_jobs:
@@ -141,7 +141,7 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
 
 
 @contextmanager
-def termination_as_interrupt() -> Iterator[None]:
+def _termination_as_interrupt() -> Iterator[None]:
     """Let SIGTERM raise KeyboardInterrupt, so that `finally` blocks are run."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-N_EVALUATIONS = 20
+_N_EVALUATIONS = 20
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.eval_freq is None:
-            self.eval_freq = max(self.n_timesteps // N_EVALUATIONS, 1)
+            self.eval_freq = max(self.n_timesteps // _N_EVALUATIONS, 1)
         least = dict(n_timesteps=1, n_instances=1, samples=0, router_subsets=1, jobs=1, num_threads=1, eval_freq=1)
         for name, bound in least.items():
             if getattr(self, name) < bound:

@@ -13,7 +13,6 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import SHARED_SEED
 from sb3_uav.envs import Instances
 from sb3_uav.envs.allocation import AllocationProblem
-from sb3_uav.envs.render import require_matplotlib
 from sb3_uav.studies.compare.common_ground import (
     ROUTER_FILE,
     VALIDATION_FILE,
@@ -40,8 +39,6 @@ def run_study(settings: Settings, arguments: Sequence[str], report_only: bool = 
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If matplotlib is not installed
     """
-    # What may be missing or wrong is found before the long run, not after it.
-    require_matplotlib()
     problem = make_problem(settings.env)
     variants = read_variants(settings.variants, settings.env)
     needs_router = isinstance(problem, AllocationProblem) and not settings.its
@@ -53,20 +50,20 @@ def run_study(settings: Settings, arguments: Sequence[str], report_only: bool = 
     if needs_router:
         make_router(settings, problem)
     check_settings(settings, needs_router)
-    trainings = plan_trainings([with_common_ground(variant, settings, needs_router) for variant in variants], settings)
+    trainings = _plan_trainings([with_common_ground(variant, settings, needs_router) for variant in variants], settings)
     if not report_only:
         train_all([training for training in trainings if not training.is_finished], settings.jobs)
-    return write_report(settings, arguments, [training for training in trainings if training.is_finished])
+    return _write_report(settings, arguments, [training for training in trainings if training.is_finished])
 
 
 def with_common_ground(variant: Variant, settings: Settings, needs_router: bool) -> Variant:
     """
     Give an entry the common budget, evaluation and router.
 
-    :param variant: As its YAML has it
+    :param variant: The variant as its YAML has it
     :param settings: Settings of the comparison
     :param needs_router: Whether the common router gives the rewards
-    :return: What is trained
+    :return: The variant with the common settings
     """
 
     replaced = {"FixedSetEvalCallback", "PretrainedRouterCallback"} | (set() if settings.its else {"ITSCallback"})
@@ -83,13 +80,13 @@ def with_common_ground(variant: Variant, settings: Settings, needs_router: bool)
     return variant._replace(entry={**variant.entry, "n_timesteps": settings.n_timesteps, "callback": callbacks})
 
 
-def plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooTraining]:
+def _plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooTraining]:
     """
     Write the YAML of every variant.
 
-    :param variants: What is compared
+    :param variants: The variants to compare
     :param settings: Settings of the comparison
-    :return: All runs, seed by seed, so that an unfinished comparison is balanced
+    :return: All runs, ordered by seed, so that an unfinished comparison is balanced
     :raises ValueError: If finished runs had other settings
     """
     trainings = []
@@ -117,12 +114,12 @@ def plan_trainings(variants: Sequence[Variant], settings: Settings) -> list[ZooT
     return sorted(trainings, key=lambda training: settings.seeds.index(training.seed))
 
 
-def write_report(settings: Settings, arguments: Sequence[str], finished: Sequence[ZooTraining]) -> list[Path]:
+def _write_report(settings: Settings, arguments: Sequence[str], finished: Sequence[ZooTraining]) -> list[Path]:
     """
     :param settings: Settings of the comparison
     :param arguments: Arguments of the command, quoted in the report
     :param finished: The runs to report on
-    :return: The files
+    :return: Paths of the written files
     :raises ValueError: If there are none
     """
 
@@ -133,9 +130,7 @@ def write_report(settings: Settings, arguments: Sequence[str], finished: Sequenc
     runs = [Run(training.name, training.algo, training.seed, training.history) for training in finished]
     validation = Instances.load(settings.out / VALIDATION_FILE)
     decoding = f"greedily and as the best of {settings.samples} samples" if settings.samples > 0 else "greedily"
-    source = (
-        f"`{settings.instances.name}`" if settings.instances is not None else "drawn by random numbers that no training uses"
-    )
+    source = f"`{settings.instances.name}`" if settings.instances is not None else "drawn from a stream that no training uses"
     evaluated = (
         f"{len(validation)} instances ({source}), the same for all, decoded {decoding}, every {settings.eval_freq:,} steps"
     )
@@ -147,15 +142,15 @@ def write_report(settings: Settings, arguments: Sequence[str], finished: Sequenc
     ]
     if (settings.out / ROUTER_FILE).is_file():
         text = (settings.out / ROUTER_FILE).with_suffix(".txt").read_text()
-        notes.append(f"Router: the same one for all rewards, which never learns during the runs: {text}.")
+        notes.append(f"Router: the same one for all rewards, which is not trained during the runs: {text}.")
     elif settings.its:
         notes.append(
-            "Router: each run trains its own by ITS, so rewards differ; its episodes take time but are no steps here."
+            "Router: each run trains its own by ITS, so rewards differ; its episodes take time but do not count as steps."
         )
     notes += [f"Machine: {machine(settings.num_threads, settings.jobs, settings.device)}.", f"Versions: {versions()}."]
 
     def shown(words: Sequence[str]) -> str:
-        # The name of the folder, so that the report does not say where it lay.
+        # Only the name of the folder, so that the report contains no absolute path.
         return shlex.join(words).replace(str(settings.out), settings.out.name)
 
     commands = {"The whole comparison": shown(["sb3-uav", "compare", *arguments])}

@@ -1,4 +1,4 @@
-"""What :mod:`sb3_uav.studies.compare.study` compares: entries of our YAMLs, with changes."""
+"""The variants of a comparison: entries of our YAMLs with changes."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from sb3_uav.zoo.configs import default_config, plain_numbers
+from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
-SHARED_SAMPLES = 8
+_SHARED_SAMPLES = 8
 # The paper tests on 10,000 instances after each epoch, which would take longer than small epochs themselves.
-ROLLOUT_TEST_INSTANCES = 1_000
+_ROLLOUT_TEST_INSTANCES = 1_000
 
 
 class Variant(NamedTuple):
     """
-    One of the things that are compared.
+    One of the compared trainings.
 
-    :param name: How tables and figures call it
+    :param name: Name in tables and figures
     :param algo: rl_zoo3's name of the algorithm
     :param entry: The complete YAML entry of the environment, callbacks included
     """
@@ -35,7 +33,7 @@ class Variant(NamedTuple):
         return re.sub(r"[^A-Za-z0-9]+", "-", self.name).strip("-").lower()
 
 
-def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str, Any]:
+def _read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str, Any]:
     """
     :param algo: rl_zoo3's name of an algorithm
     :param env_id: Id of an environment
@@ -46,32 +44,29 @@ def read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[str
     path = default_config(algo) if conf_file is None else Path(conf_file)
     if path is None or not path.is_file():
         raise ValueError(f"algo {algo!r}: there is no YAML {path or f'zoo_configs/{algo}.yml'}; name one as conf_file.")
-    try:
-        entries = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
+    entries = read_yaml(path)
+    if not isinstance(entries.get(env_id), dict):
         raise ValueError(f"{path}: has no entry for {env_id}; add one, or compare on another environment.")
     return plain_numbers(entries[env_id])
 
 
-def default_variants(env_id: str) -> dict[str, dict[str, Any]]:
+def _default_variants(env_id: str) -> dict[str, dict[str, Any]]:
     """
     :param env_id: Id of an environment
     :return: PPO, MaskablePPO, and REINFORCE with two baselines, the latter with equally many episodes per update and per epoch
     """
-    entry = read_entry("reinforce", env_id)
+    entry = _read_entry("reinforce", env_id)
     n_samples = entry.get("n_samples", 1)
     episodes = entry["n_envs"] * n_samples
     if entry.get("baseline") != "shared":
-        n_samples = SHARED_SAMPLES
+        n_samples = _SHARED_SAMPLES
     shared = dict(algo="reinforce", baseline="shared", n_samples=n_samples, n_envs=max(episodes // n_samples, 1))
     rollout = dict(algo="reinforce", baseline="rollout", n_samples=1, n_envs=episodes)
     if "instances_per_epoch" in entry:
         epoch = entry["instances_per_epoch"] * entry.get("n_samples", 1)
         shared["instances_per_epoch"], rollout["instances_per_epoch"] = max(epoch // n_samples, 1), epoch
     baseline = entry["baseline_kwargs"] if entry.get("baseline") == "rollout" and "baseline_kwargs" in entry else {}
-    rollout["baseline_kwargs"] = {"n_test_instances": ROLLOUT_TEST_INSTANCES, **baseline}
+    rollout["baseline_kwargs"] = {"n_test_instances": _ROLLOUT_TEST_INSTANCES, **baseline}
     shared["baseline_kwargs"] = None
     return {
         "PPO": dict(algo="ppo"),
@@ -85,26 +80,17 @@ def read_variants(path: Path | None, env_id: str) -> list[Variant]:
     """
     :param path: A YAML of variants; the default ones when None
     :param env_id: Id of the environment
-    :return: The variants with the entries of their YAMLs, as they stand there but for what the variants replace
+    :return: The variants with their complete YAML entries
     :raises ValueError: If something is missing or not allowed; the message names it
     """
-    if path is None:
-        given = default_variants(env_id)
-    else:
-        if not path.is_file():
-            raise FileNotFoundError(f"--variants {path}: no such file.")
-        try:
-            given = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ValueError(f"--variants {path}: cannot be read: {error}") from error
-    changes_of = list(given.values()) if isinstance(given, dict) else []
-    if not changes_of or not all(isinstance(changes, dict) and "algo" in changes for changes in changes_of):
+    given = _default_variants(env_id) if path is None else read_yaml(path)
+    if not given or not all(isinstance(changes, dict) and isinstance(changes.get("algo"), str) for changes in given.values()):
         raise ValueError(f"--variants {path}: must be a mapping from names to mappings with at least the key 'algo'.")
     variants = []
     for name, changes in given.items():
         changes = plain_numbers(changes)
         algo = changes.pop("algo")
-        entry = {**read_entry(algo, env_id, changes.pop("conf_file", None)), **changes}
+        entry = {**_read_entry(algo, env_id, changes.pop("conf_file", None)), **changes}
         variants.append(Variant(str(name), algo, {key: value for key, value in entry.items() if value is not None}))
     folders = [variant.folder for variant in variants]
     if len(set(folders)) < len(folders) or "" in folders:
@@ -132,9 +118,9 @@ def callbacks_of(entry: dict[str, Any]) -> list[Any]:
 def router_settings(env_id: str) -> dict[str, Any]:
     """
     :param env_id: Id of an allocation environment
-    :return: How our YAML for REINFORCE trains the router beside its allocator; nothing if it does not
+    :return: Settings of the router in our REINFORCE entry; empty if the entry trains no router
     """
-    for callback in callbacks_of(read_entry("reinforce", env_id)):
+    for callback in callbacks_of(_read_entry("reinforce", env_id)):
         if callback_name(callback) == "ITSCallback" and isinstance(callback, dict):
             return dict(next(iter(callback.values()))["router"])
     return {}

@@ -1,4 +1,4 @@
-"""Evaluations on the paper's kind of instances, shared by all tables and figures that need the same results."""
+"""Evaluations on instances of the paper's distribution, shared by all tables and figures that need the same results."""
 
 from __future__ import annotations
 
@@ -7,28 +7,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from sb3_uav.common.random_streams import TEST_SEED
+from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.evaluation.set_evaluation import Progress
 from sb3_uav.evaluation.summary import SummaryRow
+from sb3_uav.reproduce.pairs import Model
+from sb3_uav.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
+from sb3_uav.reproduce.scales import Scale, Scenario
 from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.unavailable import UnavailableSolver
-from sb3_uav.studies.reproduce.pairs import Model
-from sb3_uav.studies.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
-from sb3_uav.studies.reproduce.scales import Scale, Scenario
+from sb3_uav.training.its_schedule import INDEPENDENT
 
-# The paper's baselines, and which solver stands for each.
+# The solvers that stand for the paper's baselines.
 BASELINES = {"milp": GUROBI, "ortools": OR_TOOLS, "kmeans-vnd": KMEANS_VND, "kmeans-am": KMEANS_AM}
 
 
 class Results(NamedTuple):
     """
-    :param rows: What each solver achieved, by its name
-    :param failures: What went wrong
+    :param rows: Summary of each solver, by its name
+    :param failures: Error messages
     """
 
     rows: dict[str, SummaryRow]
@@ -38,14 +37,14 @@ class Results(NamedTuple):
 @dataclass(frozen=True)
 class Evaluator:
     """
-    Runs solvers on test instances; results that are there already are used again.
+    Runs solvers on test instances; existing results are reused.
 
     :param scale: The scale
     :param out: Folder of all results; those of the evaluations are in ``evaluations``
-    :param seed: Of test instances and solvers
+    :param seed: Seed of test instances and solvers
     :param device: Device of the networks
-    :param n_jobs: How many instances to solve at once, by solvers that treat them one by one
-    :param overwrite: Whether to start anew instead
+    :param n_jobs: Number of instances solved at once by solvers that solve them one by one
+    :param overwrite: Whether to discard existing results
     :param progress: Called before each solver starts and after each of its instances
     """
 
@@ -56,20 +55,20 @@ class Evaluator:
     n_jobs: int = 1
     overwrite: bool = False
     progress: Progress | None = None
-    # Folders that were written by this process, which are not to be started anew.
+    # Folders written by this process, which overwrite must not discard.
     _begun: set[Path] = field(default_factory=set)
 
     def instances(self, scenario: Scenario, seed: int | None = None, n_instances: int | None = None) -> Instances:
         """
         :param scenario: The paper's name of the situation
-        :param seed: Of these instances; the test instances when None
-        :param n_instances: How many; as many as the scale says when None
-        :return: Uniform instances; fewer of them are the first of more
+        :param seed: Seed of the instances; that of the test instances when None
+        :param n_instances: Number of instances; that of the scale when None
+        :return: Uniform instances; a smaller number gives the first of a larger one
         """
         generator = UniformGenerator(self.scale.n_tasks(scenario), scenario.n_uavs, max_distance=self.scale.max_distance)
         n_instances = self.scale.n_instances[scenario.n_tasks] if n_instances is None else n_instances
         key = (TEST_SEED, self.seed) if seed is None else (seed,)
-        return generator(n_instances, np.random.default_rng([*key, scenario.n_uavs, scenario.n_tasks]))
+        return generator(n_instances, keyed_generator(*key, scenario.n_uavs, scenario.n_tasks))
 
     def run(
         self, scenario: Scenario, solvers: Sequence[Solver], instances: Instances | None = None, folder: str = ""
@@ -79,7 +78,7 @@ class Evaluator:
         :param solvers: The solvers
         :param instances: The instances; the scale's test instances when None
         :param folder: Appended to the name of the folder
-        :return: What each achieved
+        :return: Summaries and failures
         :raises ValueError: If earlier results are of other instances, or of other solvers of the same name
         """
         path = self.out / "evaluations" / (scenario.folder + folder)
@@ -96,7 +95,7 @@ class Evaluator:
     def baseline(self, solver: str, router: Model | None = None) -> Solver:
         """
         :param solver: Name of a solver that is not trained, or ``"kmeans-am"``
-        :param router: Whose router ``"kmeans-am"`` uses
+        :param router: The pair whose router ``"kmeans-am"`` uses
         :return: The solver with the time limit of the scale; one that refuses all instances if a package is missing
         :raises ValueError: If there is no such solver
         """
@@ -118,7 +117,7 @@ class Evaluator:
             try:
                 found = make_solver(spec, device=self.device)
             except (ImportError, ValueError) as error:
-                # A package or a licence.
+                # A package or a license is missing.
                 found = UnavailableSolver(spec, str(error))
         found.name = f"{name} ({limit:g} s)" if limit is not None else name
         return found
@@ -133,13 +132,13 @@ class Evaluator:
 
         decode = "sampling" if sampling else "greedy"
         solver = load_dl_drl(str(model.allocator), str(model.router), decode, self.scale.samples, self.device)
-        method = "DL-DRL-I" if model.strategy == "independent" else "DL-DRL"
+        method = "DL-DRL-I" if model.strategy == INDEPENDENT else "DL-DRL"
         solver.name = f"{method} {model.label} ({f'sampling {self.scale.samples}' if sampling else 'greedy'})"
         return solver
 
 
 def _refusal(solver: Solver, instances: Instances) -> str | None:
-    """Why a solver cannot solve the instances, if it cannot."""
+    """The reason why a solver cannot solve the instances, if there is one."""
     try:
         solver.check(instances)
     except ValueError as error:
@@ -149,8 +148,8 @@ def _refusal(solver: Solver, instances: Instances) -> str | None:
 
 def complete(row: SummaryRow | None, measure: Callable[[SummaryRow], float]) -> float | None:
     """
-    :param row: What a solver achieved
-    :param measure: What of it
-    :return: That, if the solver has solved all instances
+    :param row: Summary of a solver, if there is one
+    :param measure: Selects a figure of the summary
+    :return: The figure; None if the solver has not solved all instances
     """
     return None if row is None or row.n_feasible < row.n_instances else measure(row)

@@ -1,4 +1,4 @@
-"""Training one pair through the zoo, so that an interrupted training goes on where it stopped."""
+"""Training one pair through the zoo; an interrupted training resumes from its checkpoint."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ import yaml
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.registration import allocation_id
-from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
 TRAINING_FILE = "training.json"
-CONFIG_FILE, OUTPUT_FILE = "config.yml", "output.txt"
+_CONFIG_FILE, _OUTPUT_FILE = "config.yml", "output.txt"
 ITS_KEY = "sb3_uav.training.ITSCallback"
 
 
 class TrainingError(ValueError):
-    """A training that failed."""
+    """A failed training."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +68,14 @@ class PairTraining:
         return self.entry["callback"][0][ITS_KEY]
 
     @property
-    def n_epochs(self) -> tuple[int, int]:
-        """How many epochs of pre-training and of the allocator there are."""
-        pretraining = 0 if self.strategy.startswith("ITS/pre-training") else self.its["n_pretraining_epochs"]
-        return pretraining, self.its["n_epochs"]
+    def schedule(self) -> EpochSchedule:
+        """The epochs of both levels."""
+        its = self.its
+        names = ("n_epochs", "n_pretraining_epochs", "n_intensive_epochs", "n_continuous_epochs")
+        return EpochSchedule.of(self.strategy, *(its[name] for name in names))
 
     def newest_run(self) -> Path | None:
-        """:return: The zoo's folder of the latest run that has a checkpoint, if there is one"""
+        """:return: The zoo's folder of the latest run with a checkpoint, if there is one"""
         from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 
         runs = [state.parents[1] for state in self.run_folder.glob(f"reinforce/*/{CHECKPOINT_FOLDER}/{STATE_FILE}")]
@@ -83,18 +85,18 @@ class PairTraining:
 def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: str) -> dict[str, Any]:
     """
     :param scale: The scale
-    :param recipe: How pairs are trained
-    :param scenario: What for
+    :param recipe: Training settings
+    :param scenario: The scenario to train for
     :param strategy: The training strategy
     :return: The zoo's YAML entry of the scenario with the changes of the recipe
     :raises FileNotFoundError: If the zoo's YAML is missing
     """
-    from sb3_uav.zoo.configs import default_config, plain_numbers
+    from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
     config = default_config("reinforce")
     if config is None:
         raise FileNotFoundError("reinforce.yml: not found; install sb3-uav again.")
-    shipped = yaml.safe_load(config.read_text(encoding="utf-8"))[allocation_id(scenario.n_uavs, scenario.n_tasks)]
+    shipped = read_yaml(config)[allocation_id(scenario.n_uavs, scenario.n_tasks)]
     entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
     its = entry["callback"][0][ITS_KEY]
     its |= {**recipe.its, "strategy": strategy, "verbose": 1}
@@ -103,7 +105,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
         entry["instances_per_epoch"] = recipe.instances_per_epoch[scenario.n_tasks]
     sizes = {"n_tasks": scale.n_tasks(scenario), "max_distance": scale.max_distance}
     entry["env_kwargs"] = sizes
-    # More than enough: the strategy ends the training after its last epoch.
+    # An upper bound: the strategy ends the training after its last epoch.
     n_instances = entry["instances_per_epoch"] + entry["n_envs"]
     entry["n_timesteps"] = its["n_epochs"] * n_instances * entry.get("n_samples", 1) * sizes["n_tasks"]
     # Independent of what YAML anchors share.
@@ -112,7 +114,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
 
 def train_pair(job: PairTraining) -> None:
     """
-    Train a pair, or go on with an interrupted training, and put its zips where they belong.
+    Train a pair, or resume its training, and copy its zips to the folder of models.
 
     :param job: The training
     :raises TrainingError: If it fails; the message names the file with its output
@@ -121,7 +123,7 @@ def train_pair(job: PairTraining) -> None:
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
 
     job.run_folder.mkdir(parents=True, exist_ok=True)
-    config = job.run_folder / CONFIG_FILE
+    config = job.run_folder / _CONFIG_FILE
     text = yaml.safe_dump({job.env_id: job.entry}, sort_keys=False)
     run = job.newest_run()
     if run is not None and config.is_file() and config.read_text(encoding="utf-8") != text:
@@ -130,11 +132,11 @@ def train_pair(job: PairTraining) -> None:
         )
     with replaced_when_complete(config) as file:
         file.write(text)
-    if run is None or read_state(run / CHECKPOINT_FOLDER)["epoch"] < job.n_epochs[1]:
+    if run is None or read_state(run / CHECKPOINT_FOLDER)["epoch"] < job.schedule.n_epochs:
         _run_zoo(job, config, run)
         run = job.newest_run()
-    if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.n_epochs[1]:
-        # rl_zoo3 takes Ctrl-C for the end of the training.
+    if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.schedule.n_epochs:
+        # rl_zoo3 treats Ctrl-C as the end of the training.
         raise KeyboardInterrupt
     _publish(job, run, state)
 
@@ -143,7 +145,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     """
     :param job: The training
     :param config: Its YAML
-    :param interrupted: The zoo's folder of the run to go on with
+    :param interrupted: The zoo's folder of the run to resume
     :raises TrainingError: If it fails
     """
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
@@ -156,7 +158,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     if interrupted is not None:
         checkpoint = interrupted / CHECKPOINT_FOLDER
         arguments += ["--trained-agent", str(checkpoint / read_state(checkpoint)["allocator"])]
-    output = job.run_folder / OUTPUT_FILE
+    output = job.run_folder / _OUTPUT_FILE
     with output.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
         code = zoo_train.main(arguments)
     if code != 0:
@@ -166,11 +168,11 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
 
 def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     """
-    Copy what a complete training left to the folder of models.
+    Copy the files of a complete training to the folder of models.
 
     :param job: The training
     :param run: The zoo's folder of the run
-    :param state: Of its checkpoint
+    :param state: State of its checkpoint
     """
     from sb3_uav.training.epoch_log import LOG_FILE
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER
@@ -181,7 +183,15 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["allocator"], temporary / ALLOCATOR_FILE)
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["router"], temporary / ROUTER_FILE)
     shutil.copyfile(run / LOG_FILE, temporary / ITS_LOG)
-    about = {"seed": job.seed, "strategy": job.strategy, "entry": job.entry, "run": str(run), **describe_machine()}
+    n_router_epochs = job.schedule.n_router_epochs
+    about = {
+        "seed": job.seed,
+        "strategy": job.strategy,
+        "n_router_epochs": n_router_epochs,
+        "entry": job.entry,
+        "run": str(run),
+        **describe_machine(),
+    }
     (temporary / TRAINING_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     os.replace(temporary, job.model_folder)
 
@@ -190,14 +200,14 @@ def check_complete(job: PairTraining) -> bool:
     """
     :param job: A training
     :return: Whether it is complete
-    :raises TrainingError: If what is there was trained with other settings
+    :raises TrainingError: If the existing pair was trained with other settings
     """
     path = job.model_folder / TRAINING_FILE
     if not path.is_file():
         return False
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-        same = about["entry"] == job.entry and about["seed"] == job.seed
+        same = _same_training(about, job)
     except (ValueError, LookupError, TypeError) as error:
         raise TrainingError(f"{path}: is damaged ({error}); delete {job.model_folder}.") from error
     if not same:
@@ -206,3 +216,18 @@ def check_complete(job: PairTraining) -> bool:
             "name its folder by --models to use it as it is."
         )
     return True
+
+
+def _same_training(about: Mapping[str, Any], job: PairTraining) -> bool:
+    """
+    :param about: What :data:`TRAINING_FILE` says of a trained pair
+    :param job: A training
+    :return: Whether the pair is its result. Earlier versions used the paper's names of the strategies, and trained the router
+        of DL-DRL-I in the epochs of pre-training only
+    """
+    its = {**about["entry"]["callback"][0][ITS_KEY]}
+    its["strategy"] = strategy_name(its["strategy"])
+    entry = {**about["entry"], "callback": [{ITS_KEY: its}, *about["entry"]["callback"][1:]]}
+    n_router_epochs = job.schedule.n_router_epochs
+    earlier = its["n_pretraining_epochs"] if job.strategy == INDEPENDENT else n_router_epochs
+    return entry == job.entry and about["seed"] == job.seed and about.get("n_router_epochs", earlier) == n_router_epochs

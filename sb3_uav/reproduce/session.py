@@ -1,17 +1,17 @@
-"""What all tables and figures of one call share."""
+"""State shared by all tables and figures of one call."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from sb3_uav.studies.reproduce.evaluator import BASELINES, Evaluator
-from sb3_uav.studies.reproduce.origin import Origin, write_figure
-from sb3_uav.studies.reproduce.pairs import Models
-from sb3_uav.studies.reproduce.scales import Scale, Scenario
-from sb3_uav.studies.reproduce.table_formats import Table, write_table
+from sb3_uav.reproduce.evaluator import BASELINES, Evaluator
+from sb3_uav.reproduce.origin import Origin
+from sb3_uav.reproduce.output_files import write_files
+from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.scales import Scale, Scenario
+from sb3_uav.reproduce.table_formats import Table
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Session:
     :param models: The trained pairs
     :param evaluator: Runs solvers
     :param solvers: Names of the solvers to compare with: baselines of the paper, and others, which become further columns
-    :param origin: What every file says of its origin
+    :param origin: The origin that every file states
     :param out: Folder of all results
     """
 
@@ -34,29 +34,22 @@ class Session:
 
     @property
     def extra_solvers(self) -> list[str]:
-        """Those that the paper does not have."""
+        """Solvers that the paper does not have."""
         return [solver for solver in self.solvers if solver not in BASELINES]
 
-    def write_table(self, table: Table, name: str) -> list[Path]:
+    def write(self, table: Table, name: str, drawn: Table | None = None) -> list[Path]:
         """
         :param table: The table
-        :param name: Of the files
-        :return: The files
+        :param name: Name of the files, without suffix
+        :param drawn: The data of its figure, which may be the table itself; None if it has no figure
+        :return: Paths of the written files
         """
-        return write_table(table, self.origin.lines(), self.out / name)
-
-    def write_figure(self, figure: Any, name: str) -> list[Path]:
-        """
-        :param figure: A matplotlib figure
-        :param name: Of the files
-        :return: The files
-        """
-        return write_figure(figure, self.origin, self.out / name)
+        return write_files(table, self.origin, self.out, name, drawn)
 
 
 class Notes:
     """
-    Collects what a reader has to know, everything once.
+    Collects notes for the reader, without repetitions.
 
     :param first: The first notes
     """
@@ -72,7 +65,7 @@ class Notes:
 
     def add_stand_ins(self, scale: Scale, scenarios: Sequence[Scenario]) -> None:
         """
-        Say which scenarios are solved by pairs that were trained for others, and that others stand in for them.
+        Note which scenarios are solved by pairs trained for others, and at which sizes.
 
         :param scale: The scale
         :param scenarios: The scenarios

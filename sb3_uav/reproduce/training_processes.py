@@ -1,4 +1,4 @@
-"""Training several pairs, side by side in processes of their own if asked to."""
+"""Training several pairs, one after the other or in parallel processes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
 from typing import NamedTuple
 
-from sb3_uav.studies.reproduce.epoch_lines import EpochLines
-from sb3_uav.studies.reproduce.pair_training import PairTraining, TrainingError, train_pair
+from sb3_uav.reproduce.epoch_lines import EpochLines
+from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair
 
 
 def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
     """
     :param jobs: Trainings
-    :param n_jobs: How many of them to run at once, each in a process of its own if there are several
-    :raises TrainingError: If one fails; those that run are ended, and go on from their last epochs the next time
+    :param n_jobs: Number of trainings at once, each in a separate process if there are several
+    :raises TrainingError: If one fails; running ones are stopped, and resume from their last epochs in the next call
     :raises KeyboardInterrupt: If one is interrupted
     """
     if n_jobs == 1 or len(jobs) < 2:
@@ -47,11 +47,11 @@ def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
 
 class TrainingProcess(NamedTuple):
     """
-    A training in a process of its own.
+    A training in a separate process.
 
     :param job: The training
     :param process: The process
-    :param errors: Says what went wrong
+    :param errors: Receives the error message
     """
 
     job: PairTraining
@@ -64,7 +64,7 @@ class TrainingProcess(NamedTuple):
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(target=train_in_process, args=(job, sender), daemon=True)
         process.start()
-        # The last end to be closed is the process's, so that its death ends the pipe.
+        # Only the child keeps the sending end, so that its death closes the pipe.
         sender.close()
         return cls(job, process, receiver)
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.evaluation.summary import SummaryRow, gaps
-from sb3_uav.solvers.base import Solver
-from sb3_uav.studies.reproduce.evaluator import BASELINES, complete
-from sb3_uav.studies.reproduce.pairs import INDEPENDENT, ITS, Model, read_log
-from sb3_uav.studies.reproduce.paper import (
+from sb3_uav.reproduce.evaluator import BASELINES, complete
+from sb3_uav.reproduce.pairs import Model, read_log
+from sb3_uav.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
     FULL_BLOCK,
@@ -31,22 +30,24 @@ from sb3_uav.studies.reproduce.paper import (
     paper_figure,
     paper_tables,
 )
-from sb3_uav.studies.reproduce.scales import Scenario, scenarios
-from sb3_uav.studies.reproduce.session import Notes, Session
-from sb3_uav.studies.reproduce.table_formats import MISSING, Column, Table, best, number
+from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.session import Notes, Session
+from sb3_uav.reproduce.table_formats import Column, Table, number
+from sb3_uav.solvers.base import Solver
+from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 PAPER, OURS = "paper", "ours"
-FASTEST_SHOWN = 0.1
+_FASTEST_SHOWN = 0.1
 
 
 class PhaseTimes(NamedTuple):
     """
-    Seconds per instance, NaN where the log does not tell.
+    Seconds per instance; NaN where the log does not contain them.
 
-    :param upper: Of the allocator's epochs
-    :param lower: Of the router's, without the time that went into its instances
-    :param generation: Of making the router's instances
-    :param n_instances: How many instances an epoch has
+    :param upper: Seconds of the allocator's epochs
+    :param lower: Seconds of the router's epochs, without generating its instances
+    :param generation: Seconds spent generating the router's instances
+    :param n_instances: Instances per epoch
     """
 
     upper: float
@@ -58,9 +59,9 @@ class PhaseTimes(NamedTuple):
 def seconds(value: float | None) -> str:
     """
     :param value: A time
-    :return: Text for a cell, with more digits where two would say nothing
+    :return: Text for a cell, with more digits for short times
     """
-    return number(value, 2 if value is None or math.isnan(value) or value >= FASTEST_SHOWN else 4)
+    return number(value, 2 if value is None or math.isnan(value) or value >= _FASTEST_SHOWN else 4)
 
 
 # ---------------------------------------------------------------------------------------------------------------- Table I
@@ -70,16 +71,16 @@ def table1(session: Session) -> list[Path]:
     """
     Time of training per epoch: upper level, lower level, generation of the lower level's data.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     models = session.models.timed(scenarios())
     groups = [Column(source, phase) for phase in PHASES for source in (PAPER, OURS)]
-    table = Table(f"Table I: {paper_tables()['table1']['caption']}", [Column("Situation"), *groups])
+    table = Table("Table I", paper_tables()["table1"]["caption"], [Column("Situation"), *groups])
     notes = Notes(
         f"Minutes per epoch of {INSTANCES_PER_EPOCH:,} instances. The paper's: one RTX 3090, two from 300 tasks on. Ours are "
         "measured over fewer instances and multiplied; the first epoch, whose baseline is cheaper, is left out.",
-        "Lower-level and data generation: epochs of the alternate phase, where an epoch's subsets are all generated anew.",
+        "Lower-level and data generation: epochs of the alternate phase, where all subsets of an epoch are newly generated.",
     )
     given = session.models.given
     own = [scenario.name for scenario, model in models.items() if given is not None and model.folder.is_relative_to(given)]
@@ -91,8 +92,6 @@ def table1(session: Session) -> list[Path]:
     measured: dict[int, list[str]] = {}
     missing: list[str] = []
     for scenario in scenarios():
-        if scenario.n_tasks == SIZES[0]:
-            table.start_part()
         times = phase_times(models[scenario]) if scenario in models else None
         if times is None:
             missing.append(scenario.name)
@@ -106,7 +105,7 @@ def table1(session: Session) -> list[Path]:
     if missing:
         notes.add(f"Not trained at scale {session.scale.name}, or without the log of the training: {', '.join(missing)}.")
     table.notes = [*notes.list(), *paper_tables()["table1"]["faults"]]
-    return session.write_table(table, "table1")
+    return session.write(table, "table1")
 
 
 def _batch_size(session: Session) -> int:
@@ -117,8 +116,8 @@ def _batch_size(session: Session) -> int:
 def phase_times(model: Model) -> PhaseTimes:
     """
     :param model: A trained pair with the log of its training
-    :return: How long the phases of an epoch took
-    :raises ValueError: If the log is something else
+    :return: Durations of the phases of an epoch
+    :raises ValueError: If the file is not such a log
     """
     assert model.its_log is not None
     rows = read_log(model.its_log)
@@ -127,7 +126,7 @@ def phase_times(model: Model) -> PhaseTimes:
     alternate = [row for row in rows if row["level"] == "router" and row["phase"] == "alternate"]
     lower = alternate[1:] or alternate
     nothing = {"seconds": "nan", "generation_seconds": "nan", "n_instances": "1"}
-    # A log of an earlier version does not tell the generation from the learning.
+    # Logs of earlier versions do not separate generation from training.
     generation = _per_instance(lower or [nothing], "generation_seconds")
     return PhaseTimes(
         _per_instance(upper or [nothing], "seconds"),
@@ -149,8 +148,8 @@ def table2(session: Session) -> list[Path]:
     """
     Experiment results with 4 UAVs.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _results_table(session, "table2", "Table II", 4)
 
@@ -159,19 +158,19 @@ def table3(session: Session) -> list[Path]:
     """
     Experiment results with 6 UAVs.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     return _results_table(session, "table3", "Table III", 6)
 
 
-def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list[Path]:
+def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list[Path]:
     """
-    :param session: What to do it with
-    :param name: Of the files and of the paper's data
-    :param title: Its number
-    :param n_uavs: The fleet
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param name: Name of the files, and of the table in the paper's data
+    :param label: Its number
+    :param n_uavs: Number of UAVs
+    :return: Paths of the written files
     """
     here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
     pairs = trained_pairs(session, here)
@@ -179,7 +178,7 @@ def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list
     blocks = {EXACT_BLOCK: EXACT_COLUMNS, FULL_BLOCK: (*FULL_COLUMNS, *extras)}
     columns = [Column(column, block) for block, methods in blocks.items() for column in methods]
     heading = [Column("Number of tasks"), Column("Measure"), Column("Source")]
-    table = Table(f"{title}: {paper_tables()[name]['caption']}", [*heading, *columns])
+    table = Table(label, paper_tables()[name]["caption"], [*heading, *columns])
     notes = Notes("Gap: to the best method of the same block, in percent. Time: wall time per instance.")
     notes.add_stand_ins(session.scale, here)
     _say_how_many(session, notes)
@@ -199,28 +198,25 @@ def _results_table(session: Session, name: str, title: str, n_uavs: int) -> list
             }
             for block, methods in blocks.items()
         }
-        table.start_part()
-        for label, measure in MEASURES.items():
+        for title, measure in MEASURES.items():
             for source, figures in ((PAPER, papers), (OURS, ours)):
-                cells, bold = [str(scenario.n_tasks), label, source], []
+                cells = [str(scenario.n_tasks), title, source]
                 for block in blocks:
-                    if measure != "seconds":
-                        bold += [len(cells) + index for index in best(figures[block][measure], smallest=measure == "gap")]
                     show = seconds if measure == "seconds" and source == OURS else number
                     cells += [show(value) for value in figures[block][measure]]
-                table.add(cells, bold)
+                table.add(cells)
     _say_how_exact(errors, notes)
     faults = [f"The paper's table: {fault}" for fault in paper_tables()[name]["faults"]]
     table.notes = [*notes.list(), *faults]
-    return session.write_table(table, name)
+    return session.write(table, name)
 
 
 def trained_pairs(
     session: Session, wanted: Sequence[Scenario], strategies: Sequence[str] = (ITS, INDEPENDENT)
 ) -> dict[tuple[Scenario, str], Model]:
     """
-    :param session: Finds or trains them
-    :param wanted: What is to be solved
+    :param session: The session, which finds or trains the pairs
+    :param wanted: The scenarios to solve
     :param strategies: Training strategies
     :return: The pairs that solve the scenarios; without those that are missing and may not be trained
     """
@@ -233,24 +229,27 @@ def _solvers(
     session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
 ) -> dict[str, Solver]:
     """
-    :param session: What to do it with
-    :param scenario: What is to be solved
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param scenario: The scenario to solve
     :param pairs: The trained pairs
-    :param notes: What is left out is said there
-    :return: The solvers by their columns
+    :param notes: Receives what is left out
+    :return: The solvers by column
     """
     found: dict[str, Solver] = {}
     trained = session.scale.trained_for(scenario)
     independent, ours = pairs.get((trained, INDEPENDENT)), pairs.get((trained, ITS))
     for solver, column in BASELINES.items():
         if solver not in session.solvers:
-            notes.add(f"{column} was not asked for (--solvers).")
+            notes.add(f"{column} was not requested (--solvers).")
         elif solver != "kmeans-am":
             found[column] = session.evaluator.baseline(solver)
         elif independent is not None:
             found[column] = session.evaluator.baseline(solver, independent)
     if KMEANS_AM in found:
-        notes.add(f"{KMEANS_AM} uses the router of DL-DRL-I, which has learned from whole uniform instances only.")
+        notes.add(
+            f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only, for as many "
+            "epochs as that of DL-DRL."
+        )
     for column, model, sampling in (
         (INDEPENDENT_GREEDY, independent, False),
         (INDEPENDENT_SAMPLING, independent, True),
@@ -260,7 +259,7 @@ def _solvers(
         if model is not None:
             found[column] = session.evaluator.pair(model, sampling)
         else:
-            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids to train one.")
+            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids training one.")
     found |= {solver: session.evaluator.baseline(solver) for solver in session.extra_solvers}
     return found
 
@@ -281,12 +280,12 @@ def _say_how_exact(errors: Sequence[float], notes: Notes) -> None:
     if known:
         notes.add(
             f"Our instances are not the paper's: the standard errors of our mean objectives go up to {max(known):.2f}. "
-            "Methods of the same block solve the same instances, and can be compared more exactly than that."
+            "Methods of the same block solve the same instances, and are comparable more precisely."
         )
 
 
 def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """What the solvers of the exact block achieve, by their columns."""
+    """Summaries of the solvers of the exact block, by column."""
     scale = session.scale
     chosen = {column: solvers[column] for column in EXACT_COLUMNS if column in solvers}
     if GUROBI in chosen:
@@ -302,14 +301,14 @@ def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Sol
 
 
 def _block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """What solvers achieve on the test instances, by their columns."""
+    """Summaries of solvers on the test instances, by column."""
     results = session.evaluator.run(scenario, list(solvers.values()))
     notes.add(*results.failures)
     return {column: results.rows[solver.name] for column, solver in solvers.items() if solver.name in results.rows}
 
 
 def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[str, list[float | None]]:
-    """The figures of a block: for every measure one for each method."""
+    """The figures of a block: for each measure, one per method."""
     objectives = [complete(rows.get(method), lambda row: row.objective) for method in methods]
     shown = [math.nan if objective is None else objective for objective in objectives]
     return {
@@ -324,17 +323,17 @@ def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[st
 
 def table4(session: Session) -> list[Path]:
     """
-    Generalisation of pairs trained with 500 tasks to 600 and more.
+    Generalization of pairs trained with 500 tasks to 600 and more.
 
-    :param session: What to do it with
-    :return: The files
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :return: Paths of the written files
     """
     here = scenarios(LARGER_SIZES)
     pairs = trained_pairs(session, here)
     methods = (*LARGER_METHODS, *session.extra_solvers)
     columns = [Column(title, f"N={size}") for size in LARGER_SIZES for title in ("Obj.", "Time(s)")]
     heading = [Column("Fleet"), Column("Method"), Column("Source")]
-    table = Table(f"Table IV: {paper_tables()['table4']['caption']}", [*heading, *columns])
+    table = Table("Table IV", paper_tables()["table4"]["caption"], [*heading, *columns])
     labels = dict.fromkeys(model.label for model in pairs.values())
     notes = Notes(
         f"DL-DRL and DL-DRL-I: sampling, with the pairs {', '.join(labels) or '(none)'} (the paper's: U4-500, U6-500).",
@@ -345,7 +344,6 @@ def table4(session: Session) -> list[Path]:
     notes.add(f"Our instances: {counts}; the paper does not say how many it has.")
     errors: list[float] = []
     for n_uavs in dict.fromkeys(scenario.n_uavs for scenario in here):
-        table.start_part()
         ours = {size: _larger(session, Scenario(n_uavs, size), pairs, notes) for size in LARGER_SIZES}
         errors += [row.standard_error for rows in ours.values() for row in rows.values()]
         found = {
@@ -368,24 +366,22 @@ def table4(session: Session) -> list[Path]:
             for source in (PAPER, OURS):
                 if source == PAPER and method in session.extra_solvers:
                     continue
-                cells, bold = [f"U{n_uavs}", method, source], []
+                cells = [f"U{n_uavs}", method, source]
                 for size in LARGER_SIZES:
                     figures = found[source][size]
                     for measure in ("objective", "seconds"):
                         show = seconds if measure == "seconds" and source == OURS else number
-                        if position in best(figures[measure], measure == "seconds", show):
-                            bold.append(len(cells))
                         cells.append(show(figures[measure][position]))
-                table.add(cells, [column for column in bold if cells[column] != MISSING])
+                table.add(cells)
     _say_how_exact(errors, notes)
     table.notes = [*notes.list(), *paper_tables()["table4"]["faults"]]
-    return session.write_table(table, "table4")
+    return session.write(table, "table4")
 
 
 def _larger(
     session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
 ) -> dict[str, SummaryRow]:
-    """What the methods of Table IV achieve, by their names."""
+    """Summaries of the methods of Table IV, by name."""
     columns = {"DL-DRL-I": INDEPENDENT_SAMPLING, "DL-DRL": SAMPLING}
     all_solvers = _solvers(session, scenario, pairs, Notes())
     solvers = {
@@ -395,5 +391,5 @@ def _larger(
     }
     for method in LARGER_METHODS:
         if method not in solvers:
-            notes.add(f"{method} was not asked for (--solvers), or --no-training forbids to train its pair.")
+            notes.add(f"{method} was not requested (--solvers), or --no-training forbids training its pair.")
     return _block(session, scenario, solvers, notes)

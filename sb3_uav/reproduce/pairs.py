@@ -1,4 +1,4 @@
-"""The trained pairs: those that the user has, those that were trained before, and those that have to be trained."""
+"""Finding trained pairs: the user's own, those trained before, and those still to be trained."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_uav.studies.reproduce.pair_training import (
+from sb3_uav.reproduce.pair_training import (
     ALLOCATOR_FILE,
     ITS_LOG,
     ROUTER_FILE,
@@ -15,20 +15,20 @@ from sb3_uav.studies.reproduce.pair_training import (
     check_complete,
     training_entry,
 )
-from sb3_uav.studies.reproduce.scales import Recipe, Scale, Scenario
-from sb3_uav.studies.reproduce.training_processes import train_pairs
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.reproduce.training_processes import train_pairs
+from sb3_uav.training.its_schedule import ALTERNATE_ONLY, INDEPENDENT, ITS, NO_INTENSIVE, NO_PRETRAINING
 
-ITS, INDEPENDENT = "ITS", "independent"
 LEVELS = ("allocator", "router")
 # Folders of the strategies; those of the ablation without what their names say.
 STRATEGY_FOLDERS = {
     ITS: "ITS",
-    "ITS/pre-training": "ITS-without-pre-training",
-    "ITS/intensive": "ITS-without-intensive",
-    "ITS/pre-training&intensive": "ITS-without-both",
+    NO_PRETRAINING: "ITS-without-pre-training",
+    NO_INTENSIVE: "ITS-without-intensive",
+    ALTERNATE_ONLY: "ITS-without-both",
     INDEPENDENT: "independent",
 }
-# What has to be in every line of a log.
+# Required columns of a log and their types.
 LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
 
 
@@ -37,10 +37,10 @@ class Model:
     """
     A trained pair.
 
-    :param scenario: What it was trained for
-    :param strategy: How
-    :param folder: Where its files are
-    :param label: What it is called: the scenario, or that it is for more than one
+    :param scenario: The scenario that it was trained for
+    :param strategy: Its training strategy
+    :param folder: Folder of its files
+    :param label: Name in tables and figures: the scenario, the fleet, or ``"universal"``
     """
 
     scenario: Scenario
@@ -67,7 +67,7 @@ def read_log(its_log: Path) -> list[dict[str, str]]:
     """
     :param its_log: The ``its_log.csv`` of a training
     :return: Its lines, one for every epoch
-    :raises ValueError: If it is something else; the message names file and line
+    :raises ValueError: If the file is not such a log; the message names file and line
     """
     remedy = f"give the {ITS_LOG} that the training wrote, or take the file away"
     try:
@@ -92,7 +92,7 @@ def read_log(its_log: Path) -> list[dict[str, str]]:
 
 class Models:
     """
-    Finds trained pairs, and trains those that are missing.
+    Finds trained pairs and trains missing ones.
 
     :param scale: The scale
     :param out: Folder of all results; trained pairs are in ``models`` and, for Table I, in ``timing``
@@ -104,7 +104,7 @@ class Models:
     :param num_threads: Threads of torch; its own choice when None, one if there are several jobs
     :param n_jobs: How many trainings run at once
     :param training: Whether to train what is missing
-    :raises FileNotFoundError: If ``given`` is no folder
+    :raises FileNotFoundError: If ``given`` is not a folder
     """
 
     def __init__(
@@ -132,8 +132,8 @@ class Models:
     def get(self, wanted: Iterable[tuple[Scenario, str]], log_needed: bool = False) -> dict[tuple[Scenario, str], Model]:
         """
         :param wanted: Scenarios and strategies
-        :param log_needed: Whether a pair without the log of its training is of no use
-        :return: Their pairs; without those that are missing and may not be trained
+        :param log_needed: Whether to ignore pairs without the log of their training
+        :return: The pairs, without those that are missing and may not be trained
         :raises TrainingError: If a training fails
         :raises KeyboardInterrupt: If a training is interrupted
         """
@@ -193,7 +193,7 @@ class Models:
         )
 
     def _trained(self, jobs: dict[tuple[Scenario, str], PairTraining]) -> dict[tuple[Scenario, str], Model]:
-        """Those that are trained, after training what is missing."""
+        """The trained pairs, after training missing ones."""
         todo = [job for job in jobs.values() if not check_complete(job)]
         if self.training:
             train_pairs(todo, self.n_jobs)

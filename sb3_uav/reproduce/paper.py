@@ -1,4 +1,4 @@
-"""What the paper itself reports: its Tables I to IV, as data."""
+"""The figures of the paper's Tables I to IV."""
 
 from __future__ import annotations
 
@@ -7,21 +7,24 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from sb3_uav.registration import GENERALISATION_SIZES, PAPER_FLEETS, PAPER_SIZES
+from sb3_uav.registration import GENERALIZATION_SIZES, PAPER_FLEETS, PAPER_SIZES
+from sb3_uav.training.its_schedule import ALTERNATE_ONLY, ITS, NO_INTENSIVE, NO_PRETRAINING, PAPER_STRATEGIES
 
 FLEETS = PAPER_FLEETS
-# Of Tables I to III and all figures.
+# Numbers of tasks in Tables I to III and in all figures.
 SIZES = PAPER_SIZES
-# Of Table IV, which ends at 1000 tasks in the paper.
-LARGER_SIZES = GENERALISATION_SIZES
-# Of an epoch.
+# Numbers of tasks in Table IV, which ends at 1000 in the paper.
+LARGER_SIZES = GENERALIZATION_SIZES
+# Training instances of an epoch.
 INSTANCES_PER_EPOCH = 1_280_000
 MAX_DISTANCE = 2.0
 # "all the instances are randomly generated with seed 1234" (section V-B, of Fig. 3)
 FIG3_SEED = 1234
 # The ablation of Fig. 5.
 ABLATION_FLEET, ABLATION_SIZE = 4, 80
-ABLATION_STRATEGIES = ("ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive")
+ABLATION_STRATEGIES = (ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY)
+# Names of the training strategies in tables and figures.
+STRATEGY_TITLES = {name: title for title, name in PAPER_STRATEGIES.items()}
 
 EXACT_BLOCK, FULL_BLOCK = "30 instances", "500 instances"
 GUROBI = "Gurobi (1800s)"
@@ -50,8 +53,8 @@ def paper_tables() -> dict[str, Any]:
 def paper_figure(table: str, *path: str) -> float | None:
     """
     :param table: ``"table1"`` to ``"table4"``
-    :param path: Where the figure stands in the ``rows`` of the table
-    :return: The figure that the paper prints, None if it prints none
+    :param path: Keys of the figure in the ``rows`` of the table
+    :return: The figure that the paper prints; None if it prints none
     """
     found: Any = paper_tables()[table]["rows"]
     for key in path:

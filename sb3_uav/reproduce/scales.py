@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_uav.studies.reproduce.paper import FLEETS, LARGER_SIZES, MAX_DISTANCE, SIZES
+from sb3_uav.reproduce.paper import FLEETS, LARGER_SIZES, MAX_DISTANCE, SIZES
 
 
 @dataclass(frozen=True)
@@ -24,24 +24,24 @@ class Scenario:
 
     @property
     def name(self) -> str:
-        """As the paper writes it."""
+        """Name in the paper."""
         return f"U{self.n_uavs}-{self.n_tasks}"
 
     @property
     def folder(self) -> str:
-        """As folders are called."""
+        """Name of its folders."""
         return f"U{self.n_uavs}-N{self.n_tasks}"
 
 
 @dataclass(frozen=True)
 class Recipe:
     """
-    How pairs are trained: the zoo's YAML entry of the scenario, with these changes.
+    Training settings of pairs: the zoo's YAML entry of the scenario with these changes.
 
-    :param allocator: Changes of the entry itself, that is of the allocator's algorithm
-    :param router: Changes of the router's algorithm
-    :param its: Changes of the interactive training strategy
-    :param instances_per_epoch: By the paper's number of tasks; the entry's where it is not given
+    :param allocator: Changes to the entry itself, i.e., to the allocator's algorithm
+    :param router: Changes to the router's algorithm
+    :param its: Changes to the interactive training strategy
+    :param instances_per_epoch: Instances per epoch by the paper's number of tasks; that of the entry where missing
     """
 
     allocator: Mapping[str, Any] = field(default_factory=dict)
@@ -53,19 +53,19 @@ class Recipe:
 @dataclass(frozen=True)
 class Scale:
     """
-    The settings of all nine commands.
+    The settings of all tables and figures.
 
-    :param name: What ``--scale`` calls it
-    :param text: What it is, in one sentence
+    :param name: Value of ``--scale``
+    :param text: Description in one sentence
     :param shrink: The paper's numbers of tasks are divided by this
     :param max_distance: Maximum flight distance
-    :param trained_sizes: For which of the paper's numbers of tasks pairs are trained; others are solved by the nearest
-    :param recipe: How
-    :param timing: How the runs that Table I times are trained; it times those of the other tables when None
+    :param trained_sizes: The paper's numbers of tasks that pairs are trained for; others are solved by the nearest pair
+    :param recipe: Training settings of these pairs
+    :param timing: Training settings of the runs that Table I times; those of the other tables when None
     :param n_instances: Test instances by the paper's number of tasks (Tables II to IV, Figs. 6 and 7)
     :param n_exact_instances: Test instances of the exact solver
-    :param exact_sizes: For which numbers of tasks it runs at all
-    :param exact_backend: Which exact solver
+    :param exact_sizes: Numbers of tasks that it is run on
+    :param exact_backend: Backend of the exact solver
     :param time_limits: Seconds per instance by solver; the others run to their end, as all but the exact one do in the paper
     :param samples: Samples per instance of "Sampling"
     """
@@ -87,13 +87,13 @@ class Scale:
     def n_tasks(self, scenario: Scenario) -> int:
         """
         :param scenario: One of the paper's
-        :return: How many tasks its instances have at this scale
+        :return: The number of tasks of its instances at this scale
         """
         return scenario.n_tasks // self.shrink
 
     def trained_for(self, scenario: Scenario) -> Scenario:
         """
-        :param scenario: What is to be solved
+        :param scenario: The scenario to solve
         :return: The scenario, of the same fleet, whose pair solves it: itself if it is trained at this scale, else the one
             whose number of tasks is nearest in proportion
         """
@@ -109,10 +109,10 @@ def scenarios(sizes: tuple[int, ...] = SIZES) -> list[Scenario]:
     return [Scenario(n_uavs, n_tasks) for n_uavs in FLEETS for n_tasks in sizes]
 
 
-# The paper's networks, smaller. Its batch normalisation needs larger batches than these scales have.
+# The paper's networks, smaller. Its batch normalization needs larger batches than these scales have.
 TINY = {"preset": "paper", "normalization": "instance", "embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16}
 SMALL = {"preset": "paper", "normalization": "instance", "embed_dim": 64, "n_layers": 2, "n_heads": 4, "ff_dim": 128}
-# Eight samples per instance, whose mean is the baseline: no second rollout, and far fewer instances.
+# Eight samples per instance with their mean as the baseline: no second rollout and far fewer instances.
 SHARED_BASELINE = {"baseline": "shared", "n_samples": 8, "normalize_advantage": True, "learning_rate": 1e-3}
 
 SMOKE = Scale(

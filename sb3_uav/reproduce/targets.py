@@ -1,4 +1,4 @@
-"""What ``sb3-uav reproduce`` can make, and the solvers that it compares with."""
+"""The targets of ``sb3-uav reproduce``, and the solvers that it compares with."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sb3_uav.studies.reproduce.session import Session
+    from sb3_uav.reproduce.session import Session
 
 TARGETS = ("table1", "table2", "table3", "table4", "fig3", "fig4", "fig5", "fig6", "fig7")
 DEFAULT_SOLVERS = ("milp", "ortools", "kmeans-vnd", "kmeans-am")
 
 
 def target_functions() -> dict[str, Callable[[Session], list[Path]]]:
-    """:return: What makes the tables and figures, by their names"""
-    from sb3_uav.studies.reproduce import figures_3_to_7, tables_1_to_4
+    """:return: The functions that make the tables and figures, by name"""
+    from sb3_uav.reproduce import figures_3_to_7, tables_1_to_4
 
     modules = (tables_1_to_4, figures_3_to_7)
     return {name: getattr(modules[0] if name.startswith("table") else modules[1], name) for name in TARGETS}
@@ -23,7 +23,7 @@ def target_functions() -> dict[str, Callable[[Session], list[Path]]]:
 
 def check_solvers(names: Sequence[str]) -> None:
     """
-    :param names: Of ``--solvers``
+    :param names: Values of ``--solvers``
     :raises ValueError: If one is not the name of a solver that needs no zips, or is given twice
     """
     from sb3_uav.solvers import SOLVERS
@@ -31,6 +31,6 @@ def check_solvers(names: Sequence[str]) -> None:
     known = sorted(set(SOLVERS) - {"dl-drl", "dl-drl-i"})
     for name in names:
         if name not in known:
-            raise ValueError(f"--solvers: {name!r} is not one of {known}; trained pairs are always there.")
+            raise ValueError(f"--solvers: {name!r} is not one of {known}; trained pairs are always included.")
         if names.count(name) > 1:
             raise ValueError(f"--solvers names {name!r} twice.")

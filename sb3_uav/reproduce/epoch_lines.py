@@ -7,9 +7,9 @@ import threading
 from collections.abc import Sequence
 from types import TracebackType
 
-from sb3_uav.studies.reproduce.pair_training import PairTraining
+from sb3_uav.reproduce.pair_training import PairTraining
 
-# Seconds between two looks at the logs of running trainings.
+# Seconds between two reads of the logs of running trainings.
 POLL_INTERVAL = 1.0
 
 
@@ -18,7 +18,7 @@ class EpochLines:
     Prints a line for every epoch that ends while the ``with`` block lasts.
 
     :param jobs: The trainings
-    :param prefix: What every line begins with
+    :param prefix: Prefix of every line
     """
 
     def __init__(self, jobs: Sequence[PairTraining], prefix: str) -> None:
@@ -27,7 +27,7 @@ class EpochLines:
         self._n_lines = {job.title: len(self._lines(job)) for job in jobs}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-        # The trainings of this process send theirs into a file.
+        # Trainings in this process redirect sys.stderr to a file.
         self._stream = sys.stderr
 
     def __enter__(self) -> EpochLines:
@@ -48,7 +48,7 @@ class EpochLines:
             lines = self._lines(job)
             for line in lines[self._n_lines[job.title] :]:
                 epoch, level, phase, _, objective, seconds = line.split(",")[:6]
-                n_epochs = f" of {job.n_epochs[1]}" if level == "allocator" else ""
+                n_epochs = f" of {job.schedule.n_epochs}" if level == "allocator" else ""
                 text = f"{level} epoch {epoch}{n_epochs} ({phase}): {float(objective):.2f} tasks, {float(seconds):.0f} s"
                 self.print(f"{job.title}: {text}")
             self._n_lines[job.title] = len(lines)
@@ -63,6 +63,6 @@ class EpochLines:
 
     def print(self, text: str) -> None:
         """
-        :param text: What else to say
+        :param text: A further line
         """
         print(self.prefix + text, file=self._stream, flush=True)

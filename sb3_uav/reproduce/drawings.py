@@ -1,0 +1,182 @@
+"""Figures 3 to 7, drawn from the tables in the CSV files beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.render import require_matplotlib
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.evaluation.summary import gaps
+from sb3_uav.plots.figure_files import new_figure
+from sb3_uav.plots.schedule_map import MapPanel, schedules_figure
+from sb3_uav.plots.style import MARKERS, MAX_MARKERS, ORANGE, PURPLE, SERIES_COLORS, VERMILION, style_axes
+from sb3_uav.reproduce.paper import SIZES
+from sb3_uav.reproduce.table_formats import MISSING, Table
+
+_MAPS_PER_LINE = 3
+DEPOT = "depot"
+UPPER_LEVEL, LOWER_LEVEL = "Upper level", "Lower level"
+SCHEDULE_COLUMNS = ("Situation", "Point", "x", "y", "Maximum distance", "UAV", "Stop")
+CURVE_COLUMNS = ("Training", "Level", "Epoch", "Phase", "Cost", "Minutes")
+
+
+class Curve(NamedTuple):
+    """
+    :param cost: ``(n_epochs,)``, minus the mean objective of the training episodes
+    :param minutes: ``(n_epochs,)``, time since the beginning of the training
+    :param n_pretraining: Number of epochs of pre-training
+    """
+
+    cost: np.ndarray
+    minutes: np.ndarray
+    n_pretraining: int
+
+
+def _draw_schedules(table: Table) -> Any:
+    """
+    Fig. 3.
+
+    :param table: A row for each depot and task; the UAVs' numbers and stops begin with 1, and skipped tasks have neither
+    :return: A matplotlib figure
+    """
+    panels = []
+    for situation in dict.fromkeys(row[0] for row in table.rows):
+        rows = [row for row in table.rows if row[0] == situation]
+        (depot,) = (row for row in rows if row[1] == DEPOT)
+        tasks = [row for row in rows if row[1] != DEPOT]
+        n_uavs = int(situation[1:].partition("-")[0])
+        instances = Instances.from_arrays(
+            depot=np.array([depot[2:4]], dtype=np.float64),
+            tasks=np.array([[row[2:4] for row in tasks]], dtype=np.float64),
+            max_distance=float(depot[4]),
+            n_uavs=n_uavs,
+        )
+        routes = []
+        for uav in range(1, n_uavs + 1):
+            stops = {int(row[6]): task for task, row in enumerate(tasks) if row[5] == str(uav)}
+            routes.append([stops[stop] for stop in sorted(stops)])
+        title = f"{situation}: {sum(map(len, routes))} of {len(tasks)} tasks"
+        panels.append(MapPanel(instances, 0, Schedule(routes), title))
+    return schedules_figure(panels, _MAPS_PER_LINE)
+
+
+def _read_curves(table: Table) -> dict[str, dict[str, Curve]]:
+    """
+    :param table: A row for each epoch of each level
+    :return: The curves by training and level
+    """
+    curves: dict[str, dict[str, Curve]] = {}
+    for training, level in dict.fromkeys((row[0], row[1]) for row in table.rows):
+        rows = [row for row in table.rows if row[:2] == [training, level]]
+        cost, minutes = (np.array([float(row[column]) for row in rows]) for column in (4, 5))
+        n_pretraining = sum(row[3] == "pre-training" for row in rows)
+        curves.setdefault(training, {})[level] = Curve(cost, minutes, n_pretraining)
+    return curves
+
+
+def _draw_learning_curves(table: Table) -> Any:
+    """
+    Fig. 4.
+
+    :param table: A row for each epoch of each level; the trainings are named after their scenarios
+    :return: A matplotlib figure
+    """
+    curves = _read_curves(table)
+    fleets = sorted({name.partition("-")[0] for name in curves})
+    figure = new_figure(5.5 * len(fleets), 7.0)
+    colors = dict(zip(map(str, SIZES), _shades(len(SIZES)), strict=True))
+    grid = figure.subplots(2, len(fleets), squeeze=False)
+    for line, level in zip(grid, (UPPER_LEVEL, LOWER_LEVEL), strict=True):
+        for axes, fleet in zip(line, fleets, strict=True):
+            style_axes(axes, f"{fleet}: {level.lower()}", "epoch", "cost")
+            mine = {name: levels[level] for name, levels in curves.items() if name.startswith(fleet) and level in levels}
+            for name, curve in mine.items():
+                epochs = np.arange(1, len(curve.cost) + 1)
+                look = {"color": colors[name.partition("-")[2]], "label": name}
+                axes.plot(epochs, curve.cost, linewidth=1.5, **look, **_markers(len(epochs), 0))
+            n_pretraining = max((curve.n_pretraining for curve in mine.values()), default=0)
+            if n_pretraining > 0:
+                axes.axvline(n_pretraining + 0.5, color="0.4", linestyle=":", linewidth=1.2)
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            axes.legend(fontsize=8.5, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _draw_ablation(table: Table) -> Any:
+    """
+    Fig. 5.
+
+    :param table: A row for each epoch of each level; the trainings are named after their strategies
+    :return: A matplotlib figure
+    """
+    figure = new_figure(11.0, 4.2)
+    left, right = figure.subplots(1, 2, sharey=True)
+    style_axes(left, "by epoch", "epoch of the upper level", "cost")
+    style_axes(right, "by training time", "minutes", "")
+    for position, (strategy, levels) in enumerate(_read_curves(table).items()):
+        curve = levels[UPPER_LEVEL]
+        look = {
+            "color": SERIES_COLORS[position],
+            "linewidth": 1.5,
+            "label": f"{strategy} (ours)" if strategy == "ITS" else strategy,
+        }
+        look |= _markers(len(curve.cost), position)
+        left.plot(np.arange(1, len(curve.cost) + 1), curve.cost, **look)
+        right.plot(curve.minutes, curve.cost, **look)
+    left.xaxis.get_major_locator().set_params(integer=True)
+    right.set_xlim(left=0)
+    right.legend(fontsize=8.5, frameon=False, loc="upper right")
+    return figure
+
+
+def _draw_generalization(table: Table) -> Any:
+    """
+    Figs. 6 and 7.
+
+    :param table: A row for each method, a column for each problem; pairs are named after their fleet
+    :return: A matplotlib figure
+    """
+    figure = new_figure(11.5, 4.6)
+    left, right = figure.subplots(1, 2)
+    style_axes(left, "Objective", "problem", "tasks completed (mean)")
+    style_axes(right, "Gap to the best of these methods", "problem", "gap (%)")
+    problems = [column.title for column in table.columns[1:]]
+    values = np.array([[np.nan if cell == MISSING else float(cell) for cell in row[1:]] for row in table.rows])
+    shortfalls = np.array([gaps(column) for column in values.T.tolist()]).T
+    trained = [row[0] for row in table.rows if row[0] == "universal" or row[0].startswith("U")]
+    shades = iter(_shades(len(trained)))
+    others = iter((VERMILION, PURPLE, ORANGE))
+    for position, row in enumerate(table.rows):
+        ours = row[0] in trained
+        look = {"color": next(shades) if ours else next(others), "linestyle": "-" if ours else (0, (4, 2))}
+        look |= {"marker": MARKERS[position % len(MARKERS)], "markersize": 5, "linewidth": 1.5, "label": row[0]}
+        left.plot(range(len(problems)), values[position], **look)
+        right.plot(range(len(problems)), shortfalls[position], **look)
+    for axes in (left, right):
+        axes.set_xticks(range(len(problems)), problems)
+    right.legend(fontsize=8.5, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _shades(n: int) -> list[Any]:
+    """``n`` colors of one scale, for ordered categories."""
+    return [require_matplotlib().colormaps["viridis"](position) for position in np.linspace(0.0, 0.9, n)]
+
+
+def _markers(n_points: int, position: int) -> dict[str, Any]:
+    """Marker settings, empty where markers would hide the line."""
+    return {"marker": MARKERS[position % len(MARKERS)], "markersize": 4} if n_points <= MAX_MARKERS else {}
+
+
+# What each figure is drawn from (the stem of its CSV) and how.
+DRAWINGS: Mapping[str, tuple[str, Callable[[Table], Any]]] = {
+    "fig3": ("fig3_schedules", _draw_schedules),
+    "fig4": ("fig4_curves", _draw_learning_curves),
+    "fig5": ("fig5_curves", _draw_ablation),
+    "fig6": ("fig6", _draw_generalization),
+    "fig7": ("fig7", _draw_generalization),
+}

@@ -1,0 +1,78 @@
+"""Leaving out what cannot count, before any solver sees it: tasks out of reach or without value, and UAVs without a task."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch as th
+
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.schedule import Schedule
+
+# Schedules list all UAVs of a fleet up to this size; of a larger one, idle UAVs are left out.
+LARGEST_LISTED_FLEET = 1000
+
+
+@dataclass(frozen=True)
+class CountingTasks:
+    """
+    Instances without the tasks that no UAV can reach or that are worth nothing.
+
+    :param original: ``batch`` instances
+    :param instances: The same with the remaining tasks at the beginning of each row; the original itself if all tasks count
+    :param index: ``(batch, n_slots)`` int64, the original task in each slot
+    """
+
+    original: Instances
+    instances: Instances
+    index: th.Tensor
+
+    @classmethod
+    def of(cls, instances: Instances) -> CountingTasks:
+        """
+        :param instances: ``batch`` instances, possibly padded
+        :return: What counts of them
+        """
+        counts = instances.reachable() & (instances.values > 0)
+        if th.equal(counts, instances.task_mask):
+            index = th.arange(instances.n_tasks, device=instances.device).expand(len(instances), -1)
+            return cls(instances, instances, index)
+        index = (~counts).long().argsort(dim=1, stable=True)
+        task_mask = counts.gather(1, index)
+        # A row in which no task counts keeps one padded slot.
+        n_slots = max(int(task_mask.sum(1).max()), 1)
+        arranged = replace(instances.reorder(index), task_mask=task_mask).trim(n_slots)
+        padded = ~arranged.task_mask
+        compact = replace(
+            arranged,
+            tasks=th.where(padded[..., None], arranged.depot[:, None], arranged.tasks),
+            values=arranged.values.masked_fill(padded, 0.0),
+        )
+        return cls(instances, compact, index[:, :n_slots])
+
+    def n_useful_uavs(self) -> list[int]:
+        """:return: How many UAVs of each instance can be of use: at most one per task, and at least one"""
+        return [min(self.instances.n_uavs, max(n_tasks, 1)) for n_tasks in self.instances.task_mask.sum(1).tolist()]
+
+    def schedule(self, row: int, found: Schedule) -> Schedule:
+        """
+        :param row: Row of an instance
+        :param found: A schedule of what counts of it
+        :return: The schedule of the original instance, with one route for each UAV, but not for more than
+            :data:`LARGEST_LISTED_FLEET` or than there are tasks. It is at least as good as visiting the most valuable tasks
+            one by one: where the solver found less, it is just that
+        """
+        n_useful = min(self.original.n_uavs, int(self.original.task_mask[row].sum()))
+        n_routes = min(self.original.n_uavs, max(n_useful, LARGEST_LISTED_FLEET))
+        tasks = self.index[row].tolist()
+        n_tasks = int(self.instances.task_mask[row].sum())
+        if any(not 0 <= task < n_tasks for route in found.routes for task in route):
+            # A faulty schedule stays what it is, for the checker to refuse.
+            return found
+        values = self.instances.values[row].tolist()
+        single = sorted(range(n_tasks), key=lambda task: -values[task])[:n_useful]
+        if math.fsum(values[task] for route in found.routes for task in route) < math.fsum(values[task] for task in single):
+            found = Schedule([[task] for task in single])
+        routes = [[tasks[task] for task in route] for route in found.routes]
+        return Schedule(routes + [[]] * (n_routes - len(routes)))

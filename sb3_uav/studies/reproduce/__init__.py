@@ -1,1 +1,0 @@
-"""The tables and figures of the DL-DRL paper, by one command each (``sb3-uav reproduce``)."""
