@@ -140,6 +140,61 @@ def test_progress_of_another_network(allocator: Any, tmp_path: Path, monkeypatch
         learn(16)
 
 
+def damage(path: Path, change: Any) -> None:
+    """Change the contents of a file of the imitation's progress."""
+    content = th.load(path, weights_only=True)
+    change(content)
+    th.save(content, path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.pop("lessons"),
+        lambda content: content.update(lessons=3),
+        lambda content: content.update(lessons=[3]),
+        lambda content: content["lessons"][0].pop("tours"),
+        lambda content: content["lessons"][0].pop("depot"),
+        lambda content: content["lessons"][0].update(depot=None),
+        lambda content: content["lessons"][0].update(tours=content["lessons"][0]["tours"][:-1]),
+        lambda content: content["lessons"][0].update(tours=content["lessons"][0]["tours"].float()),
+        lambda content: content["lessons"][0].update(tours=content["lessons"][0]["tours"] + 1000),
+        lambda content: content.update(rng="{}"),
+        lambda content: content.update(rng=content["rng"].replace('"state"', '"syate"')),
+        lambda content: content.update(rng=content["rng"].replace("PCG64", "MT19937")),
+        lambda content: content.pop("rng"),
+        lambda content: content.pop("settings"),
+    ],
+)
+def test_damaged_lessons_are_named(change: Any, allocator: Any, tmp_path: Path) -> None:
+    """Never a traceback of another kind."""
+
+    def learn() -> None:
+        imitate(
+            make_policy(RouterPolicy), allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, 1, 8, folder=tmp_path
+        )
+
+    learn()
+    damage(tmp_path / "lessons_0.pt", change)
+    with pytest.raises(ValueError, match=r"lessons_0.pt: not an intact file .*; remove .* to start again"):
+        learn()
+
+
+@pytest.mark.parametrize("change", [dict(n_updates="many"), dict(router=None), dict(optimizer={"state": 3})])
+def test_damaged_updates_are_named(change: Any, allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "SAVE_EVERY", 1)
+
+    def learn() -> None:
+        imitate(
+            make_policy(RouterPolicy), allocator, UniformGenerator(5, 4), np.random.default_rng(0), 8, 1, 8, folder=tmp_path
+        )
+
+    learn()
+    damage(tmp_path / "updates.pt", lambda content: content.update(change))
+    with pytest.raises(ValueError, match=r"updates.pt: "):
+        learn()
+
+
 def test_variants_are_the_same_tours(allocator: Any) -> None:
     """Some of the rows, turned, some of them backwards: as long, and as many tasks."""
     lesson = search_lessons(allocator, UniformGenerator(30, 4), np.random.default_rng(0), 60, 16)[0]

@@ -400,7 +400,9 @@ class FixedSetEvalCallback(BestPairOwner):
         values = self.history.results if self.best_by == "greedy" else self.history.sampled
         means = {name: float(mean[-1]) for name, mean in sets.means(values).items()}
         row = {"updates": n_updates(self.model), "seconds": round(float(seconds[0]), 1), **means}
-        self.table.rows.append({**row, "score": self.last_mean_reward})
+        # A row of the same update is replaced: an earlier run may have evaluated it, too.
+        earlier = [old for old in self.table.rows if old["updates"] < row["updates"]]
+        self.table = SizeTable([*earlier, {**row, "score": self.last_mean_reward}])
         for name, mean in means.items():
             self.logger.record(f"size_grid/{name}", mean)
 
