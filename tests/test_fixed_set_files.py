@@ -20,6 +20,7 @@ from sb3_uav.envs import BatchedVecEnv, Instances, TaskAllocationEnv
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import fixed_set
+from sb3_uav.training.best_pair import BestPair
 from sb3_uav.training.fixed_set_returns import evaluate_fixed_set, fingerprint
 
 pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothing")
@@ -57,10 +58,10 @@ def test_best_model_is_saved_when_the_mean_improves(best_by, tmp_path, monkeypat
         return fixed_set.FixedSetResult(greedy, np.ones(6, dtype=np.int64), sampled)
 
     monkeypatch.setattr(fixed_set, "evaluate_fixed_set", scripted)
-    monkeypatch.setattr(fixed_set, "save_atomically", lambda model, path: saved.append((model.num_timesteps, path.name)))
+    monkeypatch.setattr(BestPair, "save", lambda self, model, router, **about: saved.append(model.num_timesteps))
     callback = make_callback(tmp_path, best_by=best_by)
     make_model(PPO).learn(4 * ROLLOUT, callback=callback)
-    assert saved == [(0, "best_model.zip"), (3 * ROLLOUT, "best_model.zip")]
+    assert saved == [0, 3 * ROLLOUT]
     assert (callback.best_mean_reward, callback.last_mean_reward) == (5.0, 4.0)
 
 

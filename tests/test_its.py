@@ -14,8 +14,7 @@ from stable_baselines3.common.logger import configure
 from sb3_uav.envs import (
     plan_tours,
 )
-from sb3_uav.policies import AllocatorPolicy, RouterPolicy
-from sb3_uav.reinforce import REINFORCE
+from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.training import Freezer, ITSCallback
 from sb3_uav.training.router_trainer import RouterTrainer
 
@@ -40,11 +39,11 @@ def test_order_of_epochs_is_algorithm_1(n_uavs, n_intensive, n_continuous):
 @pytest.mark.parametrize(
     ("strategy", "expected"),
     [
-        ("ITS", "pp" + "aaii" * 2 + "atat"),
-        ("ITS/pre-training", "aaii" * 2 + "atat"),
-        ("ITS/intensive", "pp" + "at" * 6),
-        ("ITS/pre-training&intensive", "at" * 6),
-        ("independent", "pp" + "a" * 6),
+        ("its", "pp" + "aaii" * 2 + "atat"),
+        ("no-pretraining", "aaii" * 2 + "atat"),
+        ("no-intensive", "pp" + "at" * 6),
+        ("alternate-only", "at" * 6),
+        ("independent", "p" * 8 + "a" * 6),
     ],
 )
 def test_ablations_are_one_switch(strategy, expected):
@@ -145,7 +144,7 @@ def test_router_reaches_training_and_evaluation_env():
 def test_pretraining_leaves_the_allocator_alone():
     model = make_allocator(policy_kwargs=PAPER)
     start = snapshot(model.policy)
-    its = make_its(n_epochs=1, strategy="independent")
+    its = make_its(n_epochs=1, n_pretraining_epochs=2, n_intensive_epochs=2, strategy="independent")
     seed = th.initial_seed()
 
     class Compare(BaseCallback):
@@ -173,24 +172,6 @@ def test_models_can_go_on_learning_afterwards():
     model, its = make_allocator(), make_its()
     model.learn_instances(16, its)
     assert trace(its) == "pp" + "aaii" and model.n_instances == 16
-
-
-def test_best_router_when_the_last_evaluation_is_the_best(tmp_path):
-    """The last call of on_step may be the one that finds the best allocator."""
-    evaluation = EvalCallback(make_env(2), n_eval_episodes=4, eval_freq=20, best_model_save_path=str(tmp_path), verbose=0)
-    its = make_its(n_epochs=2)
-    make_allocator().learn(2 * 8 * N_TASKS, callback=[its, evaluation])
-    assert (tmp_path / "best_model.zip").is_file() and (tmp_path / "best_router.zip").is_file()
-
-
-def test_best_router_is_kept_with_the_best_allocator(tmp_path):
-    its = make_its(n_epochs=2)
-    evaluation = EvalCallback(
-        make_env(2), n_eval_episodes=4, eval_freq=5, best_model_save_path=str(tmp_path), log_path=str(tmp_path), verbose=0
-    )
-    learn(make_allocator(), its, evaluation)
-    assert its.save_path == tmp_path and (tmp_path / "best_model.zip").is_file()
-    assert isinstance(REINFORCE.load(tmp_path / "best_router.zip").policy, RouterPolicy)
 
 
 @pytest.mark.parametrize("algo", ["ppo", "ppo_mask", "a2c"])
@@ -247,7 +228,7 @@ def test_its_writes_tensorboard_for_both_levels(tmp_path):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        (dict(strategy="its"), "strategy is 'its'; choose one of"),
+        (dict(strategy="none"), "strategy is 'none'; choose one of its, .*independent.*ITS/pre-training"),
         (dict(n_epochs=0), "n_epochs is 0; it must be a whole number of at least 1"),
         (dict(n_continuous_epochs=1.5), "n_continuous_epochs is 1.5"),
         (dict(n_pretraining_epochs=-1), "n_pretraining_epochs is -1"),

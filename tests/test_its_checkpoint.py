@@ -171,18 +171,43 @@ def test_trained_allocator_without_its_router_is_refused():
         model.learn(100, callback=make_its(), reset_num_timesteps=False)
 
 
-def test_damaged_checkpoints_are_named(tmp_path):
+INTACT: dict[str, Any] = dict(epoch=3, allocator="allocator_3.zip", router="router_5.zip", records=[])
+RECORD: dict[str, Any] = dict(epoch=1, level="router", phase="alternate", n_instances=8, objective=1.5, seconds=0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"epoch": 3', "not an intact state file"),
+        ("\xff", "not an intact state file"),
+        ("[1]", r"it holds \[1\] in place of a mapping"),
+        ("null", "it holds None in place of a mapping"),
+        (json.dumps(dict(epoch=3)), r"fields \['allocator', 'records', 'router'\] are missing"),
+        (json.dumps({**INTACT, "epoch": "3"}), "epoch is '3'"),
+        (json.dumps({**INTACT, "epoch": -1}), "epoch is -1"),
+        (json.dumps({**INTACT, "router": 5}), "router is 5, not the name of a zip"),
+        (json.dumps({**INTACT, "allocator": "../other/model.zip"}), "allocator is '../other/model.zip', not the name"),
+        (json.dumps({**INTACT, "warm_started": "yes"}), "warm_started is 'yes'"),
+        (json.dumps({**INTACT, "records": {"epoch": 1}}), "records is {'epoch': 1}"),
+        (json.dumps({**INTACT, "records": [1]}), "record 0 is 1"),
+        (json.dumps({**INTACT, "records": [RECORD, dict(epoch=1)]}), "record 1 is {'epoch': 1}"),
+        (json.dumps({**INTACT, "records": [{**RECORD, "epoch": None}]}), "record 0 is"),
+        (json.dumps({**INTACT, "records": [{**RECORD, "objective": "many"}]}), "record 0 is"),
+    ],
+)
+def test_damaged_state_files_are_named(text, message, tmp_path):
+    """Never a traceback of another kind, whatever JSON the file holds."""
+    (tmp_path / "its_state.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=rf"its_state\.json: .*{message}"):
+        read_state(tmp_path)
+
+
+def test_intact_state_files_are_read(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"its_state.json: no such file; give the its_checkpoint folder"):
         read_state(tmp_path)
-    (tmp_path / "its_state.json").write_text('{"epoch": 3')
-    with pytest.raises(ValueError, match="not an intact state file"):
-        read_state(tmp_path)
-    (tmp_path / "its_state.json").write_text(json.dumps(dict(epoch=3, records=[dict(epoch=1)])))
-    with pytest.raises(ValueError, match="not an intact state file"):
-        read_state(tmp_path)
-    (tmp_path / "its_state.json").write_text(json.dumps(dict(epoch=3)))
-    with pytest.raises(ValueError, match=r"fields \['allocator', 'records', 'router'\] are missing"):
-        read_state(tmp_path)
+    state = {**INTACT, "records": [{**RECORD, "objective": float("nan")}]}
+    (tmp_path / "its_state.json").write_text(json.dumps(state))
+    assert read_state(tmp_path)["router"] == "router_5.zip"
 
 
 def test_allocator_of_another_epoch_is_refused(tmp_path):

@@ -1,31 +1,35 @@
-"""Evaluation on one fixed set of instances during training, so that the best model is that of more than a lucky draw."""
+"""Evaluation on fixed instances during training, so that the best model is that of more than a lucky draw."""
 
 from __future__ import annotations
 
 import os
 import time
 import warnings
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.random_streams import FIXED_SET_STREAM, random_stream
+from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.best_pair import BEST_MODEL_FILE, BestPair, BestPairOwner, best_model_folder, find_best_router, take_over
 from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, FixedSetResult
-from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem, fingerprint
-from sb3_uav.training.its import BEST_ROUTER_FILE, ITSCallback
+from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem
+from sb3_uav.training.instance_sets import InstanceSets, InstanceSource, SizeTable
+from sb3_uav.training.its import ITSCallback
 from sb3_uav.training.run_folder import find_run_folder
 
 INSTANCES_FILE = "evaluation_instances.npz"
-BEST_MODEL_FILE = "best_model.zip"
+# Means by size, where there are several.
+TABLE_FILE = "size_grid.csv"
 # Where a stock EvalCallback of the same run writes its results instead; it appends the suffix .npz.
 STOCK_RESULTS = "evaluations_eval_callback"
 # An attribute of the model, so that every zip of it names its earlier evaluations: SB3 starts counting steps again from 0.
@@ -34,53 +38,68 @@ STATE = "fixed_set_evaluations"
 DEFAULT_EVAL_FREQ = 25_000
 
 
-class FixedSetEvalCallback(BaseCallback):
+class FixedSetEvalCallback(BestPairOwner):
     """
-    Evaluates the policy on one fixed set of instances while it learns: greedily, and by the best of several samples.
+    Evaluates the policy on fixed instances while it learns: greedily, and by the best of several samples.
 
     For our policies on our environments, under any on-policy algorithm. In the YAML of a zoo::
 
         callback:
           - sb3_uav.training.FixedSetEvalCallback: {n_instances: 256, n_samples: 16}
 
-    The set is read from a file, or drawn once from the environment's own generator with random numbers that no training uses.
+    The instances are one set or several. They are read from files, or drawn once with random numbers that no training uses:
+    one set from the environment's own generator, or sets of uniform instances of the given ``sizes``. Models are compared by
+    their mean on a single set; on ``sizes`` or several sets by the mean logarithm of the means, so that all sets count alike.
+
     An evaluation takes place before the first rollout whose steps reach a multiple of ``eval_freq``, so that the policy has
-    learned from exactly the steps that are noted, and at the end. It neither changes the training's random states nor the
+    learned from exactly the steps that are noted, and at the end. It changes neither the training's random states nor the
     policy's mode: parameters are bit-equal with and without this callback. The router of an allocation environment is the one
     that the environment has at that time; name this callback after ``ITSCallback``.
 
-    It logs ``eval/fixed_greedy``, ``eval/fixed_sampled``, ``eval/fixed_best`` and ``eval/fixed_ep_length``, and writes into
-    the run folder:
+    It logs ``eval/fixed_greedy``, ``eval/fixed_sampled``, ``eval/fixed_best`` and ``eval/fixed_ep_length``, for ``sizes`` or
+    several sets also ``size_grid/U4-N80`` and so on, and writes into the run folder:
 
-    - ``evaluations.npz`` in SB3's format (returns of the greedy episodes) with more arrays, see :class:`EvaluationHistory`;
-    - ``best_model.zip`` whenever the mean is the best so far, and beside it ``best_router.zip`` under ``ITSCallback``;
-    - ``evaluation_instances.npz``, the set.
+    - ``evaluations.npz`` in SB3's format (returns of the greedy episodes, set after set) with more arrays, see
+      :class:`~sb3_uav.training.fixed_set_history.EvaluationHistory`;
+    - ``best_model.zip`` whenever the model is the best so far, and beside it ``best_router.zip`` under ``ITSCallback``;
+    - ``evaluation_instances.npz``, the set, or one file per set;
+    - ``size_grid.csv``, the means by set, for ``sizes`` or several sets.
 
     The run folder is that of rl_zoo3 (its ``EvalCallback`` or its monitor files name it), or the folder of the logger.
     SB3's ``EvalCallback``, which rl_zoo3 adds by itself, would write files of the same names, its best model being that of
     a few random episodes. If there is one with the same folder, it leaves ``best_model.zip`` to this callback and writes its
     results to ``evaluations_eval_callback.npz``; ``--eval-freq -1`` saves its time.
 
-    The zips of a model remember where its evaluations are. If one goes on learning (``-i`` of the zoo, or ``load`` and
-    ``learn``) with the same set, its new folder takes over the evaluations up to there and the best zips, and steps and times
-    are counted on.
+    The zips of a model name the folder of its evaluations. If it is trained further (``-i`` of the zoo, or ``load`` and
+    ``learn``) with the same instances, its new folder takes over the evaluations up to there and the best zips, and steps and
+    times continue from there.
 
-    :param instances: Path of an ``.npz`` file, or ``Instances``; drawn when None
-    :param n_instances: How many to draw
-    :param seed: Of the drawn instances and of the samples; not the seed of the training, so that all runs get the same set
+    :param instances: Path of an ``.npz`` file, or ``Instances``, or a list of these; drawn when None
+    :param n_instances: How many to draw from the environment's generator
+    :param seed: Seed for drawing the instances and for sampling; not that of the training, so that all runs get the same set
     :param n_samples: Samples per instance; 0 for greedy evaluation only
     :param eval_freq: Environment steps between evaluations, of all environments together. When None: once per epoch of
         ``ITSCallback`` or ``REINFORCE``, and every 25,000 steps under other algorithms
-    :param best_by: Whose mean the best model has: ``"greedy"`` or ``"sampled"``
+    :param best_by: Which returns decide on the best model: ``"greedy"`` or ``"sampled"``
     :param save_path: Folder of the files; the run folder when None
     :param verbose: Verbosity level: 0 for no output, 1 for a line per evaluation
+    :param sizes: UAVs, tasks and number of instances of each set to draw, such as ``[[4, 80, 48], [6, 200, 16]]``; in place of
+        ``instances`` and ``n_instances``
+    :param max_distance: Maximum flight distance of the instances of these ``sizes``
+    :param eval_updates: Updates between evaluations, in place of ``eval_freq``
     :raises FileNotFoundError: If there is no such file of instances
     :raises ValueError: If an argument is not allowed; the message names it
     """
 
+    # Beside which no other callback of the same names can write.
+    results_file: ClassVar[str] = RESULTS_FILE
+    instances_file: ClassVar[str | None] = INSTANCES_FILE
+    # Further names of the best model's zip.
+    best_copies: ClassVar[tuple[str, ...]] = ()
+
     def __init__(
         self,
-        instances: str | os.PathLike[str] | Instances | None = None,
+        instances: InstanceSource | Sequence[InstanceSource] | None = None,
         n_instances: int = 256,
         seed: int = 0,
         n_samples: int = 16,
@@ -88,6 +107,9 @@ class FixedSetEvalCallback(BaseCallback):
         best_by: str = "greedy",
         save_path: str | os.PathLike[str] | None = None,
         verbose: int = 0,
+        sizes: Sequence[Sequence[int]] | None = None,
+        max_distance: float = 2.0,
+        eval_updates: int | None = None,
     ) -> None:
         super().__init__(verbose)
         for name, value, least in (
@@ -95,6 +117,7 @@ class FixedSetEvalCallback(BaseCallback):
             ("seed", seed, 0),
             ("n_samples", n_samples, 0),
             ("eval_freq", 1 if eval_freq is None else eval_freq, 1),
+            ("eval_updates", 1 if eval_updates is None else eval_updates, 1),
         ):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
@@ -102,17 +125,27 @@ class FixedSetEvalCallback(BaseCallback):
             raise ValueError(f"best_by is {best_by!r}; choose 'greedy' or 'sampled'.")
         if best_by == "sampled" and n_samples == 0:
             raise ValueError("best_by is 'sampled', but n_samples is 0; set it to at least 1.")
-        self.instances = instances if instances is None or isinstance(instances, Instances) else Instances.load(instances)
-        self.n_instances = n_instances
+        if sizes is not None and instances is not None:
+            raise ValueError("instances and sizes are both given; give one of them.")
+        if eval_updates is not None and eval_freq is not None:
+            raise ValueError("eval_freq and eval_updates are both given; give one of them.")
         self.seed = seed
+        self.sets: InstanceSets | None = None
+        if instances is not None:
+            self.sets = InstanceSets.read(instances)
+        elif sizes is not None:
+            self.sets = InstanceSets.draw(sizes, max_distance, self._source_of_size)
+        self.n_instances = n_instances
         self.n_samples = n_samples
         self.eval_freq = eval_freq
+        self.eval_updates = eval_updates
         self.best_by = best_by
         self.save_path = None if save_path is None else Path(save_path)
 
         self.best_mean_reward = -np.inf
         self.last_mean_reward = -np.inf
         self.history: EvaluationHistory
+        self.table = SizeTable()
         self.folder: Path | None = None
         self._its: ITSCallback | None = None
         self._ready = False
@@ -120,9 +153,26 @@ class FixedSetEvalCallback(BaseCallback):
         self._steps_before = 0
         self._learned_steps = 0
         self._evaluated_epoch = 0
+        self._evaluated_updates = 0
         self._fingerprint = ""
         # A clock that stands still during evaluations: wall and CPU seconds when it showed 0.
         self._clock_start = np.zeros(2)
+
+    @property
+    def instances(self) -> Instances | None:
+        """The instances of a single set; None before they are drawn, and of several sets."""
+        if self.sets is None or len(self.sets.sets) > 1:
+            return None
+        return next(iter(self.sets.sets.values()))
+
+    @property
+    def owned_folder(self) -> Path | None:
+        """Where it keeps the best pair."""
+        return self.folder
+
+    def _source_of_size(self, n_uavs: int, n_tasks: int) -> np.random.Generator:
+        """Random numbers for the instances of a size."""
+        return random_stream(self.seed, FIXED_SET_STREAM, n_uavs, n_tasks)
 
     # ------------------------------------------------------------------------------------------------------ set-up
 
@@ -134,21 +184,24 @@ class FixedSetEvalCallback(BaseCallback):
         its = siblings(self, ITSCallback)
         self._its = its[0] if its else None
         self.folder = self._find_folder()
-        if self.instances is None:
-            self.instances = draw_fixed_set(self._problem, self.n_instances, self.seed)
+        if self.sets is None:
+            self.sets = InstanceSets.read(draw_fixed_set(self._problem, self.n_instances, self.seed))
         if not self._problem.uses_fleet:
-            self.instances = replace(self.instances, n_uavs=1)
+            self.sets = self.sets.for_one_uav()
         if isinstance(self._policy, AllocatorPolicy):
-            self._policy.check_fleet(self.instances)
-        self._fingerprint = fingerprint(self.instances, self.n_samples)
+            for instances in self.sets.sets.values():
+                self._policy.check_fleet(instances)
+        self._fingerprint = self.sets.fingerprint(self.n_samples)
         self._steps_before = max(self._state["timesteps"] - self.model.num_timesteps, 0)
-        self._continue()
+        self._continue(self.sets)
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self.instances.save(self.folder / INSTANCES_FILE)
+            if self.instances_file is not None:
+                self.sets.save(self.folder / self.instances_file)
             self._take_over(self.folder)
         self._learned_steps = self.model.num_timesteps
         self._evaluated_epoch = self._epoch() or 0
+        self._evaluated_updates = n_updates(self.model)
         self._note_state(self._now() - self._clock_start)
         self._ready = True
 
@@ -157,7 +210,7 @@ class FixedSetEvalCallback(BaseCallback):
         problem = evaluated_problem(self.training_env)
         if problem is None or not isinstance(policy, EpisodicPolicy):
             raise ValueError(
-                "FixedSetEvalCallback needs an AllocatorPolicy or RouterPolicy on an environment of sb3_uav, found "
+                f"{type(self).__name__} needs an AllocatorPolicy or RouterPolicy on an environment of sb3_uav, found "
                 f"{type(policy).__name__} on {self.training_env}; its VecEnv must be a BatchedVecEnv or a DummyVecEnv (not "
                 "--vec-env subproc) without wrappers that change observations."
             )
@@ -170,21 +223,22 @@ class FixedSetEvalCallback(BaseCallback):
         if folder is None:
             folder = find_run_folder(self)
         if folder is None:
-            warnings.warn("FixedSetEvalCallback saves nothing: set save_path to a folder.", stacklevel=3)
+            warnings.warn(f"{type(self).__name__} saves nothing: set save_path to a folder.", stacklevel=3)
             return None
         for other in siblings(self, FixedSetEvalCallback):
-            if other.folder is not None and other.folder.resolve() == folder.resolve():
-                raise ValueError(f"Two FixedSetEvalCallbacks would write to {folder}; give one of them another save_path.")
+            same_files = other.results_file == self.results_file
+            if same_files and other.folder is not None and other.folder.resolve() == folder.resolve():
+                raise ValueError(f"Two {type(self).__name__}s would write to {folder}; give one of them another save_path.")
         return folder
 
     @property
     def _state(self) -> dict[str, Any]:
-        """What the model remembers: steps and seconds of its training, and the folder of each set's evaluations."""
+        """The model's record of its training: steps and seconds, and the folder of each set's evaluations."""
         return getattr(self.model, STATE, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
 
     def _note_state(self, seconds: np.ndarray) -> None:
         """
-        Keep in the model what a zip of it must know to go on.
+        Keep in the model what a zip of it must hold for a training that continues.
 
         :param seconds: Wall and CPU seconds of the training
         """
@@ -196,43 +250,57 @@ class FixedSetEvalCallback(BaseCallback):
         }
         setattr(self.model, STATE, state)
 
-    def _continue(self) -> None:
-        """Go on with the history of what the model has learned before, or begin a new one."""
-        assert self.instances is not None
+    def _continue(self, sets: InstanceSets) -> None:
+        """Continue the history of the model's earlier training, or begin a new one."""
         folders, timesteps = self._state["folders"], self._state["timesteps"]
         if folders.get(self._fingerprint, "") is None and self._ready:
-            # No files, but this very callback has been there.
+            # No files, but this very callback was there.
             return
-        self.history = EvaluationHistory.empty(len(self.instances), self.n_samples)
+        self.history = EvaluationHistory.empty(sets.n_instances, self.n_samples)
+        self.table = SizeTable()
         self.best_mean_reward = -np.inf
         if folders.get(self._fingerprint) is None:
             return
         old = Path(folders[self._fingerprint])
         try:
-            recorded = EvaluationHistory.load(old / RESULTS_FILE)
-        except (FileNotFoundError, ValueError) as error:
+            recorded = EvaluationHistory.load(old / self.results_file)
+            if [array.shape[1:] for array in recorded] != [array.shape[1:] for array in self.history]:
+                shape = recorded.results.shape
+                raise ValueError(f"{old / self.results_file}: results of shape {shape} are of other instances.")
+            if sets.is_grid:
+                self._restore_table(old, list(sets.sets))
+        except (OSError, ValueError) as error:
             warnings.warn(f"The evaluations of the earlier run cannot be continued, new ones begin: {error}", stacklevel=3)
             return
         self.history = recorded.until(timesteps)
-        means = self._means(recorded)
-        # The best zip may be of a time after that of the zip which is going on; then it is none of this run.
-        if len(self.history.timesteps) == 0 or int(means.argmax()) >= len(self.history.timesteps):
+        scores = self._scores(recorded)
+        # The best zip may be of a time after that of the zip whose training continues; then it is none of this run.
+        if len(self.history.timesteps) == 0 or int(scores.argmax()) >= len(self.history.timesteps):
             return
-        self.best_mean_reward = float(means.max())
-        if self.folder is not None and self.folder.resolve() != old.resolve():
-            for name in (BEST_MODEL_FILE, BEST_ROUTER_FILE):
-                if (old / name).is_file():
-                    write_atomically(self.folder / name, (old / name).read_bytes())
+        self.best_mean_reward = float(scores.max())
+        self._bring_best_pair(old / BEST_MODEL_FILE, find_best_router(old))
+
+    def _restore_table(self, old: Path, names: Sequence[str]) -> None:
+        """Take over the rows of an earlier run's table up to now."""
+        rows = SizeTable.load(old / TABLE_FILE, names).rows
+        self.table = SizeTable([row for row in rows if row["updates"] <= n_updates(self.model)])
+
+    def _bring_best_pair(self, model: Path, router: Path | None) -> None:
+        """Copy the best pair of an earlier run, unless it is in place."""
+        folder = self.owned_folder
+        if folder is not None and model.is_file() and (folder / BEST_MODEL_FILE).resolve() != model.resolve():
+            BestPair(folder, self.best_copies).copy(model, router)
 
     def _take_over(self, folder: Path) -> None:
         """
-        :param folder: Where an ``EvalCallback`` shall not write files of the same names
+        :param folder: Where an ``EvalCallback`` must not write files of the same names
         """
         results = (folder / RESULTS_FILE).with_suffix("").resolve()
         for other in siblings(self, EvalCallback):
-            if other.best_model_save_path is not None and Path(other.best_model_save_path).resolve() == folder.resolve():
-                other.best_model_save_path = None
-            if other.log_path is not None and Path(other.log_path).resolve() == results:
+            best = best_model_folder(other)
+            if best is not None and best.resolve() == folder.resolve():
+                take_over(other, self.model)
+            if self.results_file == RESULTS_FILE and other.log_path is not None and Path(other.log_path).resolve() == results:
                 other.log_path = str(folder / STOCK_RESULTS)
 
     # ------------------------------------------------------------------------------------------------------ when
@@ -258,6 +326,8 @@ class FixedSetEvalCallback(BaseCallback):
         last, epoch = int(self.history.timesteps[-1]), self._epoch()
         if self._timesteps <= last:
             return False
+        if self.eval_updates is not None:
+            return n_updates(self.model) // self.eval_updates > self._evaluated_updates // self.eval_updates
         if self.eval_freq is None and epoch is not None:
             return epoch > self._evaluated_epoch
         frequency = self.eval_freq or DEFAULT_EVAL_FREQ
@@ -266,7 +336,7 @@ class FixedSetEvalCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self._learned_steps = self.model.num_timesteps
         if self._is_due():
-            self._evaluate()
+            self.evaluate()
 
     def _on_step(self) -> bool:
         self._note_state(self._now() - self._clock_start)
@@ -279,34 +349,60 @@ class FixedSetEvalCallback(BaseCallback):
     def _on_training_end(self) -> None:
         # rl_zoo3 calls this a second time, and even if the training could not start.
         if self._ready and not np.any(self.history.timesteps >= self._timesteps):
-            self._evaluate()
+            self.evaluate()
 
     # ------------------------------------------------------------------------------------------------------ what
 
-    def _means(self, history: EvaluationHistory) -> np.ndarray:
+    def _scores(self, history: EvaluationHistory) -> np.ndarray:
         """``(n_evaluations,)``: by what models are compared."""
-        return (history.results if self.best_by == "greedy" else history.sampled).mean(1)
+        assert self.sets is not None
+        return self.sets.score(history.results if self.best_by == "greedy" else history.sampled)
 
-    def _evaluate(self) -> None:
-        assert self.instances is not None
+    def evaluate(self) -> float:
+        """
+        Evaluate now, and save the model if it is the best so far.
+
+        :return: What models are compared by, see the class
+        """
+        assert self.sets is not None
         seconds = self._now() - self._clock_start
-        result = evaluate_fixed_set(self._policy, self._problem, self.instances, self.n_samples, self.seed)
+        parts = self.sets.sets.values()
+        result = FixedSetResult.concatenate(
+            [evaluate_fixed_set(self._policy, self._problem, part, self.n_samples, self.seed) for part in parts]
+        )
         self.history = self.history.append(self._timesteps, result, seconds)
         self._evaluated_epoch = self._epoch() or 0
-        self.last_mean_reward = float(self._means(self.history)[-1])
+        self._evaluated_updates = n_updates(self.model)
+        self.last_mean_reward = float(self._scores(self.history)[-1])
         improved = self.last_mean_reward > self.best_mean_reward
         self.best_mean_reward = max(self.last_mean_reward, self.best_mean_reward)
         self._note_state(seconds)
+        if self.sets.is_grid:
+            self._append_to_table(self.sets, seconds)
         if self.folder is not None:
-            if improved:
-                save_atomically(self.model, self.folder / BEST_MODEL_FILE)
-                if self._its is not None:
-                    self._its.save_best_router(self.folder)
-            self.history.save(self.folder / RESULTS_FILE, self.n_samples)
+            if improved and self.owned_folder is not None:
+                self._save_best_pair(self.owned_folder)
+            self.history.save(self.folder / self.results_file, self.n_samples)
+            if self.sets.is_grid:
+                write_atomically(self.folder / TABLE_FILE, self.table.text())
         self._report(result, improved)
         pause = self._now() - self._clock_start - seconds
         for callback in (self, *siblings(self, FixedSetEvalCallback)):
             callback._clock_start = callback._clock_start + pause
+        return self.last_mean_reward
+
+    def _save_best_pair(self, folder: Path) -> None:
+        router = None if self._its is None else self._its.router
+        about = {"timesteps": self._timesteps, "mean_reward": self.last_mean_reward}
+        BestPair(folder, self.best_copies).save(self.model, router, evaluated_by=type(self).__name__, **about)
+
+    def _append_to_table(self, sets: InstanceSets, seconds: np.ndarray) -> None:
+        values = self.history.results if self.best_by == "greedy" else self.history.sampled
+        means = {name: float(mean[-1]) for name, mean in sets.means(values).items()}
+        row = {"updates": n_updates(self.model), "seconds": round(float(seconds[0]), 1), **means}
+        self.table.rows.append({**row, "score": self.last_mean_reward})
+        for name, mean in means.items():
+            self.logger.record(f"size_grid/{name}", mean)
 
     def _report(self, result: FixedSetResult, improved: bool) -> None:
         text = f"greedy {result.greedy.mean():.2f}"

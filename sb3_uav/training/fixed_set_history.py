@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,14 @@ class FixedSetResult(NamedTuple):
     greedy: np.ndarray
     lengths: np.ndarray
     sampled: np.ndarray
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[FixedSetResult]) -> FixedSetResult:
+        """
+        :param parts: Results on several instances
+        :return: The result on all of them, in this order
+        """
+        return cls(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 class EvaluationHistory(NamedTuple):
@@ -105,4 +114,25 @@ class EvaluationHistory(NamedTuple):
         missing = set(cls._fields) - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; it was not written by FixedSetEvalCallback.")
-        return cls(**{name: arrays[name] for name in cls._fields})
+        history = cls(**{name: arrays[name] for name in cls._fields})
+        history._check(path)
+        return history
+
+    def _check(self, path: Path) -> None:
+        """:raises ValueError: If the arrays do not fit together; ``path`` names their file"""
+        n_evaluations, n_instances = (*self.results.shape, -1, -1)[:2]
+        fields: dict[str, list[tuple[int, ...]]] = {
+            "results": [(n_evaluations, n_instances)],
+            "timesteps": [(n_evaluations,)],
+            "ep_lengths": [(n_evaluations, n_instances)],
+            "sampled": [(n_evaluations, n_instances), (n_evaluations, 0)],
+            "train_seconds": [(n_evaluations,)],
+            "cpu_seconds": [(n_evaluations,)],
+        }
+        for name, shapes in fields.items():
+            array = getattr(self, name)
+            if array.shape not in shapes or array.dtype.kind not in "iuf":
+                raise ValueError(
+                    f"{path}: {name} is {array.dtype} of shape {array.shape}, which does not fit results of shape "
+                    f"{self.results.shape}; delete it and evaluate again."
+                )

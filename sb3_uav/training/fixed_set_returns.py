@@ -47,7 +47,7 @@ def evaluate_fixed_set(
     try:
         fitting = policy.rows_that_fit(instances.n_tasks + 1, max(n_samples, 1) * instances.n_uavs)
         parts = []
-        for rows in th.arange(len(instances)).split(min(CHUNK_ROWS, fitting)):
+        for rows in th.arange(len(instances), device="cpu").split(min(CHUNK_ROWS, fitting)):
             first = int(rows[0])
             parts.append(_evaluate_chunk(policy, problem, instances[rows], n_samples, seed, first))
     finally:

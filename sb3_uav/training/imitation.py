@@ -79,7 +79,7 @@ def imitate(
     n_done = 0 if progress is None else progress.restore_updates(router, optimizer, rng)
     if n_done > 0:
         report(f"imitation: goes on after {n_done} of {n_updates} updates")
-    start, total, n_moves = time.perf_counter(), th.zeros((), device=router.device), 0
+    start, total, n_moves = time.perf_counter(), th.zeros((), dtype=th.float32, device=router.device), 0
     router.set_training_mode(True)
     for update in range(n_done + 1, n_updates + 1):
         cosine = 0.5 * (1 + math.cos(math.pi * update / n_updates))
@@ -157,7 +157,8 @@ def good_tours(subsets: Instances) -> th.Tensor:
         n_trials = TRIALS_PER_TASK * int(subsets.task_mask[row].sum())
         routes.append([task + 1 for task in search.improve(Schedule([]), n_trials=n_trials).routes[0]])
     n_steps = 1 + max(map(len, routes))
-    return th.tensor([route + [0] * (n_steps - len(route)) for route in routes])
+    padded = [route + [0] * (n_steps - len(route)) for route in routes]
+    return th.tensor(padded, dtype=th.int64, device="cpu")
 
 
 def varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
@@ -171,7 +172,7 @@ def varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
     rows = rng.permutation(len(instances))[: max(batch_size * TYPICAL_SIZE // instances.n_tasks, 4)]
     instances, tours = instances[rows], tours[rows]
     length = (tours > 0).sum(1, keepdim=True)
-    steps = th.arange(tours.shape[1])
+    steps = th.arange(tours.shape[1], device=tours.device)
     backwards = tours.gather(1, th.where(steps < length, length - 1 - steps, steps))
     tours = th.where(th.from_numpy(rng.random((len(rows), 1)) < 0.5), backwards, tours)
     n_steps = int(length.max()) + 1

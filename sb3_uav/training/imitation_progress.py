@@ -65,9 +65,10 @@ class ImitationProgress:
         """
         lessons: list[Lesson] = []
         while (content := self._read(self._chunk_file(), rng)) is not None:
-            for fields in content["lessons"]:
-                tours = fields.pop("tours")
-                lessons.append(Lesson(Instances(n_uavs=1, **fields), tours))
+            try:
+                lessons += [_lesson(fields) for fields in content["lessons"]]
+            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+                raise self._damaged(self._chunk_file(), error) from error
             self._n_chunks += 1
         return lessons
 
@@ -96,12 +97,15 @@ class ImitationProgress:
         content = self._read(path, rng)
         if content is None:
             return 0
+        n_updates = content.get("n_updates")
+        if not isinstance(n_updates, int) or not {"router", "optimizer"} <= content.keys():
+            raise self._damaged(path, f"n_updates is {n_updates!r}, the fields are {sorted(map(str, content))}")
         try:
             router.load_state_dict(content["router"])
             optimizer.load_state_dict(content["optimizer"])
-        except (RuntimeError, ValueError) as error:
-            raise ValueError(f"{path}: of another network ({error}); remove {self.folder} to begin anew.") from error
-        return content["n_updates"]
+        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: of another network ({error}); remove {self.folder} to start again.") from error
+        return n_updates
 
     def _chunk_file(self) -> Path:
         return self.folder / f"lessons_{self._n_chunks}.pt"
@@ -120,10 +124,31 @@ class ImitationProgress:
             state, settings = json.loads(content["rng"]), content["settings"]
         except Exception as error:
             # Torch raises all kinds of them.
-            raise ValueError(f"{path}: not an intact file ({error}); remove {self.folder} to begin anew.") from error
+            raise self._damaged(path, error) from error
         if settings != self.settings:
             raise ValueError(
-                f"{path}: belongs to an imitation with {settings}, not {self.settings}; remove {self.folder} to begin anew."
+                f"{path}: belongs to an imitation with {settings}, not {self.settings}; remove {self.folder} to start again."
             )
-        rng.bit_generator.state = state
+        try:
+            rng.bit_generator.state = state
+        except (LookupError, TypeError, ValueError) as error:
+            raise self._damaged(path, f"state of the random numbers: {error!r}") from error
         return content
+
+    def _damaged(self, path: Path, what: object) -> ValueError:
+        return ValueError(f"{path}: not an intact file ({what}); remove {self.folder} to start again.")
+
+
+def _lesson(fields: dict[str, Any]) -> Lesson:
+    """
+    :param fields: As :meth:`ImitationProgress.save_lessons` stores them
+    :return: The lesson
+    :raises ValueError: If tours and instances do not fit together; others if the fields are of other kinds
+    """
+    tours = fields["tours"]
+    instances = Instances(n_uavs=1, **{name: fields[name] for name in INSTANCE_FIELDS})
+    if tours.dtype != th.int64 or tours.ndim != 2 or len(tours) != len(instances) or len(tours) == 0:
+        raise ValueError(f"tours are {tours.dtype} of shape {tuple(tours.shape)} for {len(instances)} instances")
+    if int(tours.min()) < 0 or int(tours.max()) > instances.n_tasks:
+        raise ValueError(f"tours name nodes {int(tours.min())} to {int(tours.max())} of {instances.n_tasks} tasks")
+    return Lesson(instances, tours)

@@ -8,19 +8,18 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream
-from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
 from sb3_uav.common.sb3_compat import n_updates, total_timesteps
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.recognition import find_problem
+from sb3_uav.training.best_pair import RouterCallback, take_over
 from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, log_text
 from sb3_uav.training.freezing import Freezer
@@ -33,7 +32,7 @@ from sb3_uav.training.its_checkpoint import (
     read_state,
     write_checkpoint,
 )
-from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule
+from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
 from sb3_uav.training.random_state import undisturbed_random_state
 from sb3_uav.training.router_handover import hand_over_router
 from sb3_uav.training.router_progress import router_progress
@@ -43,10 +42,9 @@ from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
 ROUTER_FILE = "router.zip"
-BEST_ROUTER_FILE = "best_router.zip"
 
 
-class ITSCallback(BaseCallback):
+class ITSCallback(RouterCallback):
     """
     Trains a router beside the allocator and freezes one while the other learns.
 
@@ -73,9 +71,10 @@ class ITSCallback(BaseCallback):
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
     :param router_instances_per_epoch: Instances of a router epoch, where they shall be others than those of the allocator
-    :param strategy: ``"ITS"``, or one of the paper's ablations: ``"ITS/pre-training"`` (without pre-training),
-        ``"ITS/intensive"`` (without intensive training), ``"ITS/pre-training&intensive"`` (neither), ``"independent"``
-        (DL-DRL-I: the router is only pre-trained)
+    :param strategy: ``"its"``, or one of the paper's ablations: ``"no-pretraining"``, ``"no-intensive"``,
+        ``"alternate-only"`` (neither), ``"independent"`` (DL-DRL-I: the router is only pre-trained, for as many epochs as
+        ``"its"`` would train it in all). The paper's names (``"ITS/pre-training"`` for training without it, and so on) mean
+        the same
     :param save_path: Folder of the zips; that of the other callbacks or of the monitor files when None
     :param resume_from: Folder written by an earlier run (its ``its_checkpoint``); train the allocator loaded from there
     :param checkpoint_freq: Allocator epochs between checkpoints
@@ -92,7 +91,7 @@ class ITSCallback(BaseCallback):
         n_continuous_epochs: int = 4,
         instances_per_epoch: int | None = None,
         router_instances_per_epoch: int | None = None,
-        strategy: str = "ITS",
+        strategy: str = "its",
         save_path: str | None = None,
         resume_from: str | None = None,
         checkpoint_freq: int = 1,
@@ -100,7 +99,6 @@ class ITSCallback(BaseCallback):
         warm_start: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(verbose)
-        self.schedule = EpochSchedule.of(strategy, n_epochs, n_pretraining_epochs, n_intensive_epochs, n_continuous_epochs)
         for name, value, least in (
             ("n_epochs", n_epochs, 1),
             ("n_pretraining_epochs", n_pretraining_epochs, 0),
@@ -114,11 +112,14 @@ class ITSCallback(BaseCallback):
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
         if not isinstance(router, dict) or "policy" not in router:
             raise ValueError(f"router must be a mapping with at least the key 'policy', found {router!r:.80}.")
+        self.strategy = strategy_name(strategy)
+        self.schedule = EpochSchedule.of(
+            self.strategy, n_epochs, n_pretraining_epochs, n_intensive_epochs, n_continuous_epochs
+        )
         self.router_kwargs = dict(router)
         self.n_epochs = n_epochs
         self.instances_per_epoch = instances_per_epoch
         self.router_instances_per_epoch = router_instances_per_epoch
-        self.strategy = strategy
         self.save_path = None if save_path is None else Path(save_path)
         self.resume_from = None if resume_from is None else Path(resume_from)
         self.checkpoint_freq = checkpoint_freq
@@ -135,7 +136,6 @@ class ITSCallback(BaseCallback):
         self._epoch_start = 0.0
         self._epoch_first_batch = 0
         self._instances_at_start = 0
-        self._best_mean_reward: dict[str, float] = {}
         self._instances_before = 0
         self._steps_before = 0
         self._callers_limit: int | None = None
@@ -160,6 +160,9 @@ class ITSCallback(BaseCallback):
         if self.save_path is None:
             self.save_path = self._find_save_path()
         if not self._started:
+            # Before anything is drawn or saved, so that an unseeded run has streams of its own, and keeps them.
+            self._seed()
+            self._warn_of_large_batches()
             self._set_up_router()
             self._started = True
         # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
@@ -170,6 +173,8 @@ class ITSCallback(BaseCallback):
             self._trainer.env.set_generator(WholeInstances(self.problem.generator))
             self._train_router(self.schedule.n_pretraining_epochs, PRETRAINING, first=len(self.records))
         self._trainer.freezer.freeze()
+        for evaluation in siblings(self, EvalCallback):
+            take_over(evaluation, self.model)
         if isinstance(self.model, REINFORCE):
             self._callers_limit = self.model.max_instances
             limit = self.n_epochs * self.instances_per_epoch
@@ -215,6 +220,19 @@ class ITSCallback(BaseCallback):
             self._start_router(self.warm_start)
         self._warm_started = True
 
+    def _warn_of_large_batches(self) -> None:
+        assert self.instances_per_epoch is not None
+        n_envs = self.training_env.num_envs
+        is_reinforce = isinstance(self.model, REINFORCE)
+        batch = n_envs if is_reinforce else n_envs * getattr(self.model, "n_steps", 0) // self.problem.generator.n_tasks
+        if batch > self.instances_per_epoch:
+            warnings.warn(
+                f"An update learns from {batch} instances, an epoch has {self.instances_per_epoch}: several epochs will end "
+                f"at once, each followed by its router epochs. Lower n_envs{'' if is_reinforce else ' or n_steps'}, or raise "
+                "instances_per_epoch, so that an epoch has at least one update.",
+                stacklevel=2,
+            )
+
     def _start_router(self, warm_start: WarmStart) -> None:
         rng = random_stream(self._seed(), WARM_START_STREAM)
 
@@ -251,28 +269,33 @@ class ITSCallback(BaseCallback):
         return self._instances_before + (self.model.num_timesteps - self._steps_before) // self.problem.generator.n_tasks
 
     def _begin_epoch(self) -> None:
-        self._statistics.reset_statistics()
+        assert self.instances_per_epoch is not None
         self._epoch_start = time.time()
-        self._instances_at_start = self._instances_seen()
-        self._epoch_first_batch = getattr(self.model, "n_batches", 0)
+        n_batches = getattr(self.model, "n_batches", 0)
+        if self._epoch_is_over():
+            # The last batch held this epoch, too: they share its episodes and its instances.
+            self._instances_at_start = self.epoch * self.instances_per_epoch
+            self._epoch_first_batch = max(n_batches - 1, 0)
+        else:
+            self._statistics.reset_statistics()
+            self._instances_at_start = self._instances_seen()
+            self._epoch_first_batch = n_batches
 
     def _on_rollout_start(self) -> None:
-        self._save_best_router()
-        if self._epoch_is_over():
+        while self._epoch_is_over():
             self._end_epoch()
 
     def _on_step(self) -> bool:
         self._statistics.count(self.locals)
-        self._save_best_router()
         return self.epoch < self.n_epochs
 
     def _on_training_end(self) -> None:
         # rl_zoo3 calls this a second time, and after Ctrl-C, when training the router for an epoch is not wanted.
         if not self._started:
             return
-        self._save_best_router()
-        if self.model.num_timesteps >= total_timesteps(self.model) and self._epoch_is_over():
-            self._end_epoch()
+        if self.model.num_timesteps >= total_timesteps(self.model):
+            while self._epoch_is_over():
+                self._end_epoch()
         self._save_router()
         self._trainer.freezer.thaw()
         self._allocator_freezer.thaw()
@@ -285,10 +308,15 @@ class ITSCallback(BaseCallback):
 
     def _end_epoch(self) -> None:
         """Lines 10 to 23 of Algorithm 1, after every epoch of the allocator."""
+        assert self.instances_per_epoch is not None
         self.epoch += 1
-        n_instances = self._instances_seen() - self._instances_at_start
+        end = self.epoch * self.instances_per_epoch if self._epoch_is_over() else self._instances_seen()
         phase = self.schedule.phase(self.epoch)
-        self._record("allocator", self.epoch, phase, n_instances, self._statistics.mean_return, self._epoch_start)
+        objective = self._statistics.mean_return
+        if self._statistics.n_episodes == 0:
+            # Resumed between two epochs of the same batch.
+            objective = next((r.objective for r in reversed(self.records) if r.level == "allocator"), objective)
+        self._record("allocator", self.epoch, phase, end - self._instances_at_start, objective, self._epoch_start)
         n_epochs = self.schedule.router_epochs_after(self.epoch)
         if n_epochs > 0:
             self._train_on_subsets(n_epochs, 1 / self.problem.generator.n_uavs if phase == ALTERNATE else 1.0, phase)
@@ -333,7 +361,8 @@ class ITSCallback(BaseCallback):
         return self.model.policy.arrange(training_batch(self.problem.generator, self.training_env.num_envs, rng))
 
     def _seed(self) -> int:
-        return getattr(self.model, "stream_seed", None) or self.model.seed or 0
+        """The seed of the streams that router and allocator do not have themselves; the allocator's zips keep it."""
+        return stream_seed(self.model)
 
     def _train_router(self, n_epochs: int, phase: str, first: int = 0) -> None:
         """
@@ -381,22 +410,6 @@ class ITSCallback(BaseCallback):
     def _save_router(self) -> None:
         if self.save_path is not None:
             self._trainer.save(self.save_path / ROUTER_FILE)
-
-    def _save_best_router(self) -> None:
-        """Keep the router that the best allocator was evaluated with."""
-        for callback in siblings(self, EvalCallback):
-            folder = callback.best_model_save_path
-            if folder is not None and callback.best_mean_reward > self._best_mean_reward.get(folder, -np.inf):
-                self._best_mean_reward[folder] = callback.best_mean_reward
-                self.save_best_router(Path(folder))
-
-    def save_best_router(self, folder: Path) -> None:
-        """
-        Save the router as that of the best allocator so far.
-
-        :param folder: Where that one is saved
-        """
-        save_atomically(self.router, folder / BEST_ROUTER_FILE)
 
     def _save_checkpoint(self) -> None:
         """Write both levels' zips and the state of the strategy."""

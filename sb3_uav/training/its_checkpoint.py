@@ -45,7 +45,9 @@ def write_checkpoint(
     :param warm_started: Whether the router's warm start, if there is one, is over
     :raises OSError: If a file cannot be written
     """
-    setattr(allocator, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": epoch})
+    # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
+    n_instances = getattr(allocator, "n_instances", None)
+    setattr(allocator, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances})
     # Another name before the warm start, because a zip that the state file names must not change.
     number = str(n_router_epochs(records)) if warm_started else "start"
     names = {"allocator": f"allocator_{epoch}.zip", "router": f"router_{number}.zip"}
@@ -72,7 +74,7 @@ def noted_checkpoint(allocator: BaseAlgorithm) -> Path | None:
     :return: The checkpoint that it belongs to, if it is still where it was written
     """
     noted = getattr(allocator, CHECKPOINT, None)
-    if noted is None or not (Path(noted["folder"]) / STATE_FILE).is_file():
+    if not isinstance(noted, dict) or not (Path(str(noted.get("folder"))) / STATE_FILE).is_file():
         return None
     return Path(noted["folder"])
 
@@ -89,15 +91,52 @@ def read_state(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
     try:
-        state = json.loads(path.read_text())
-        missing = {"epoch", "allocator", "router", "records"} - set(state)
-        for record in state.get("records", []):
-            EpochRecord(**record)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: not an intact state file ({error}); resume from another checkpoint.") from error
+        state = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise _damaged(path, str(error)) from error
+    if not isinstance(state, dict):
+        raise _damaged(path, f"it holds {state!r:.40} in place of a mapping")
+    missing = {"epoch", "allocator", "router", "records"} - state.keys()
     if missing:
         raise ValueError(f"{path}: fields {sorted(missing)} are missing; resume from another checkpoint.")
+    if not _is_count(state["epoch"]):
+        raise _damaged(path, f"epoch is {state['epoch']!r:.40}")
+    for level in ("allocator", "router"):
+        if not (isinstance(state[level], str) and re.fullmatch(r"[\w.-]+\.zip", state[level])):
+            raise _damaged(path, f"{level} is {state[level]!r:.40}, not the name of a zip")
+    if not isinstance(state.get("warm_started", True), bool):
+        raise _damaged(path, f"warm_started is {state['warm_started']!r:.40}")
+    if not isinstance(state["records"], list):
+        raise _damaged(path, f"records is {state['records']!r:.40}")
+    for number, record in enumerate(state["records"]):
+        if not _is_record(record):
+            raise _damaged(path, f"record {number} is {record!r:.200}")
     return state
+
+
+def _damaged(path: Path, what: str) -> ValueError:
+    return ValueError(f"{path}: not an intact state file ({what}); resume from another checkpoint.")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_record(record: Any) -> bool:
+    """Whether this is what :class:`EpochRecord` was written as."""
+    if not isinstance(record, dict):
+        return False
+    try:
+        made = EpochRecord(**record)
+    except TypeError:
+        return False
+    texts, counts = (made.level, made.phase), (made.epoch, made.n_instances)
+    numbers = (made.objective, made.seconds, made.generation_seconds)
+    return (
+        all(isinstance(text, str) for text in texts)
+        and all(_is_count(count) for count in counts)
+        and all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
+    )
 
 
 def check_allocator(folder: Path, state: dict[str, Any], allocator: BaseAlgorithm) -> None:
@@ -107,8 +146,12 @@ def check_allocator(folder: Path, state: dict[str, Any], allocator: BaseAlgorith
     :param allocator: What is going to learn
     :raises ValueError: If it is not the allocator of this checkpoint
     """
-    noted = getattr(allocator, CHECKPOINT, {"epoch": state["epoch"]})["epoch"]
-    epoch = allocator.epoch if isinstance(allocator, REINFORCE) else noted
+    noted = getattr(allocator, CHECKPOINT, None)
+    noted = noted if isinstance(noted, dict) else {}
+    epoch = noted.get("epoch", state["epoch"])
+    if isinstance(allocator, REINFORCE) and noted.get("n_instances") != allocator.n_instances:
+        # Another zip than that of the checkpoint: it must not have finished another epoch since.
+        epoch = allocator.epoch
     if epoch != state["epoch"]:
         raise ValueError(
             f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {epoch}; "

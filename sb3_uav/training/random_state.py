@@ -14,7 +14,9 @@ import torch as th
 def undisturbed_random_state() -> Iterator[None]:
     """Undo what happens to the global generators inside, such as the seeding by an algorithm's constructor."""
     states = random.getstate(), np.random.get_state()
-    with th.random.fork_rng():
-        yield
-    random.setstate(states[0])
-    np.random.set_state(states[1])
+    try:
+        with th.random.fork_rng():
+            yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])

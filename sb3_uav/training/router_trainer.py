@@ -28,7 +28,13 @@ from sb3_uav.training.random_state import undisturbed_random_state
 from sb3_uav.training.subsets import WholeInstances
 
 # Settings of the router that follow from the environment, or that its zip decides when a run is resumed.
-NOT_RELOADED = {"algo", "n_envs", "policy", "policy_kwargs"}
+_NOT_RELOADED = {"algo", "n_envs", "policy", "policy_kwargs", "seed", "device", "instances_per_epoch"}
+# Arguments of algorithms that are not the user's here.
+_REFUSED = {
+    "env": "ITSCallback makes the router's environment from the allocator's; set n_envs for its size",
+    "tensorboard_log": "the router logs beside the allocator, in the folder 'router' of its TensorBoard events",
+    "_init_setup_model": "the router needs its network when training starts",
+}
 
 
 class RouterTrainer:
@@ -36,8 +42,8 @@ class RouterTrainer:
     Trains the router epoch by epoch.
 
     :param settings: ``algo``, ``n_envs``, and the algorithm's own arguments, among them ``policy``
-    :param allocator: The allocator's algorithm, which gives seed, device and logger
-    :param n_envs: Number of environments where the settings have none
+    :param allocator: The allocator's algorithm, which gives the logger, and seed and device where the settings have none
+    :param n_envs: Number of environments where the settings have none; at most ``epoch_size`` are made
     :param generator: Draws the instances of the fleet
     :param epoch_size: Instances of a router epoch
     :raises ValueError: If a setting is not allowed; the message names it
@@ -54,8 +60,12 @@ class RouterTrainer:
         self.settings = settings
         self.epoch_size = epoch_size
         kwargs = dict(settings)
-        algo, n_envs = kwargs.pop("algo", "reinforce"), kwargs.pop("n_envs", n_envs)
+        algo = kwargs.pop("algo", "reinforce")
+        n_envs = kwargs.pop("n_envs", min(n_envs, epoch_size))
         algorithm = resolve_algorithm(algo)
+        for name, reason in _REFUSED.items():
+            if name in kwargs:
+                raise ValueError(f"router: {name} cannot be set: {reason}.")
         if kwargs["policy"] in ("RouterPolicy", f"{RouterPolicy.__module__}.RouterPolicy", "sb3_uav.policies.RouterPolicy"):
             kwargs["policy"] = RouterPolicy
         if not isinstance(n_envs, int) or n_envs < 1:
@@ -65,15 +75,16 @@ class RouterTrainer:
                 f"router: learning_rate is {kwargs['learning_rate']!r}; write a number. How many steps the router will "
                 "take is not known, so it has no schedule but lr_decay."
             )
+        if issubclass(algorithm, REINFORCE):
+            self._check_epoch(n_envs, kwargs.get("instances_per_epoch", epoch_size))
         whole = WholeInstances(generator)
         self.env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=whole)] * n_envs)
-        if algorithm is REINFORCE:
-            kwargs.setdefault("instances_per_epoch", epoch_size)
         # The next seed, because with the same one both levels would draw the same points.
-        seed = None if allocator.seed is None else allocator.seed + 1
+        kwargs.setdefault("seed", None if allocator.seed is None else allocator.seed + 1)
+        kwargs.setdefault("device", allocator.device)
         try:
             with undisturbed_random_state():
-                self.algorithm: OnPolicyAlgorithm = algorithm(env=self.env, seed=seed, device=allocator.device, **kwargs)
+                self.algorithm: OnPolicyAlgorithm = algorithm(env=self.env, **kwargs)
         except TypeError as error:
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self.policy, RouterPolicy):
@@ -82,6 +93,18 @@ class RouterTrainer:
         outputs = [f for f in allocator.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(allocator.logger.dir) / "router") if outputs and allocator.logger.dir else None
         self.algorithm.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
+
+    def _check_epoch(self, n_envs: int, instances_per_epoch: Any) -> None:
+        if instances_per_epoch != self.epoch_size:
+            raise ValueError(
+                f"router: instances_per_epoch is {instances_per_epoch!r}, a router epoch of ITSCallback has {self.epoch_size} "
+                "instances; set router_instances_per_epoch of ITSCallback instead."
+            )
+        if n_envs > self.epoch_size:
+            raise ValueError(
+                f"router: n_envs is {n_envs}, more than the {self.epoch_size} instances of a router epoch, so that most "
+                "epochs would have no batch; lower n_envs, or raise router_instances_per_epoch of ITSCallback."
+            )
 
     @property
     def policy(self) -> BasePolicy:
@@ -95,7 +118,10 @@ class RouterTrainer:
         return self.policy.plan
 
     def _prepare(self) -> None:
-        """Give the router the buffer of whole episodes, and reset its environment."""
+        """Give the router its epochs and the buffer of whole episodes, and reset its environment."""
+        if isinstance(self.algorithm, REINFORCE):
+            # Not in the constructor, which a subclass may have changed.
+            self.algorithm.instances_per_epoch = self.epoch_size
         is_stock_buffer = type(self.algorithm.rollout_buffer) in (DictRolloutBuffer, MaskableDictRolloutBuffer)
         if is_stock_buffer and not isinstance(self.algorithm, REINFORCE):
             # A YAML file cannot name a buffer class.
@@ -143,7 +169,7 @@ class RouterTrainer:
         :param path: Its zip
         :raises ValueError: If it is not an intact router
         """
-        given = self.settings.keys() - NOT_RELOADED
+        given = self.settings.keys() - _NOT_RELOADED
         # From the new router, as its constructor may have changed them.
         settings = {key: getattr(self.algorithm, key) for key in given if hasattr(self.algorithm, key)}
         try:

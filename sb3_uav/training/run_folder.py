@@ -9,6 +9,7 @@ from stable_baselines3.common.logger import HumanOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.envs.vec_env import BatchedVecEnv
+from sb3_uav.training.best_pair import best_model_folder
 from sb3_uav.training.callback_tree import siblings
 
 
@@ -22,8 +23,9 @@ def find_run_folder(callback: BaseCallback) -> Path | None:
     :return: The folder; None if there is none
     """
     for evaluation in siblings(callback, EvalCallback):
-        if evaluation.best_model_save_path is not None:
-            return Path(evaluation.best_model_save_path)
+        best = best_model_folder(evaluation)
+        if best is not None:
+            return best
         if evaluation.log_path is not None:
             return Path(evaluation.log_path).parent
     monitor = _monitor_folder(callback.training_env.unwrapped)

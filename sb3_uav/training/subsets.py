@@ -144,6 +144,6 @@ class AllocatedSubsets(SingleUavGenerator):
         :param rng: The source of randomness
         """
         instances = self.allocator.arrange(self.generator(-(-batch_size // self.generator.n_uavs), rng))
-        rows = th.arange(len(instances)).split(HELD_OUT_ROWS)
+        rows = th.arange(len(instances), device="cpu").split(HELD_OUT_ROWS)
         subsets = Instances.concatenate([self._allocate(instances[part], rng) for part in rows])
         return subsets[rng.permutation(len(subsets))[:batch_size]]

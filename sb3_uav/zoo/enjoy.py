@@ -68,8 +68,11 @@ def find_router(run_folder: Path, best: bool) -> Path | None:
     :param best: Whether to return the router of the best allocator
     :return: The router's zip, if the run has one
     """
-    names = ["best_router.zip", "router.zip"] if best else ["router.zip"]
-    return next((run_folder / name for name in names if (run_folder / name).is_file()), None)
+    from sb3_uav.training.best_pair import find_best_router
+
+    best_router = find_best_router(run_folder) if best else None
+    router = run_folder / "router.zip"
+    return best_router or (router if router.is_file() else None)
 
 
 def _create_test_env(create_test_env: Any, model: str | None, router: Path | None, env_id: str, **kwargs: Any) -> Any:
