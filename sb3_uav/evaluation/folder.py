@@ -157,8 +157,8 @@ class EvaluationFolder:
             if before != now:
                 described = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
                 raise ValueError(
-                    f"{self.folder}: holds results of other instances: {described[0]}, not {described[1]}; give the same files "
-                    f"in the same order, {remedy}."
+                    f"{self.folder}: holds results of other instances: {described[0]}, not {described[1]}; "
+                    f"give the same files in the same order, {remedy}."
                 )
         for name, solver in settings["solvers"].items():
             was, is_now = solvers.get(name), solver["settings"]

@@ -20,8 +20,8 @@ class KMeansVND(OneByOneSolver):
     K-means clusters of the tasks, one for every UAV, and variable neighborhood descent on each (the paper's K-means+VND).
 
     Every tour starts with the nearest feasible tasks of its cluster. Three neighborhoods are searched in turn until none has
-    an improvement: shorter tours (2-opt, or-opt), insertion of an unvisited task, and replacement of a visited task by one that
-    is worth more, or as much on a shorter tour. Tours exchange no tasks.
+    an improvement: shorter tours (2-opt, or-opt), insertion of an unvisited task, and replacement of a visited task by one
+    that is worth more, or as much on a shorter tour. Tours exchange no tasks.
 
     :param restarts: Number of starts of K-means; the most compact clusters are kept
     :raises ValueError: If there is not at least one start
