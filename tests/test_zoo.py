@@ -13,13 +13,13 @@ import yaml
 from stable_baselines3.common.results_plotter import load_results
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.its_checkpoint import read_state
 
 pytest.importorskip("rl_zoo3")

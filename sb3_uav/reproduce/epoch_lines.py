@@ -56,7 +56,7 @@ class EpochLines:
     @staticmethod
     def _lines(job: PairTraining) -> list[str]:
         """The lines of the log of its newest run, without the header."""
-        from sb3_uav.training.epoch_log import LOG_FILE
+        from sb3_uav.common.epoch_log import LOG_FILE
 
         logs = sorted(job.run_folder.glob(f"reinforce/*/{LOG_FILE}"), key=lambda log: log.stat().st_mtime)
         return logs[-1].read_text(encoding="utf-8").splitlines()[1:] if logs else []

@@ -174,7 +174,7 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     :param run: The zoo's folder of the run
     :param state: State of its checkpoint
     """
-    from sb3_uav.training.epoch_log import LOG_FILE
+    from sb3_uav.common.epoch_log import LOG_FILE
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER
 
     temporary = job.model_folder.with_name(job.model_folder.name + ".tmp")

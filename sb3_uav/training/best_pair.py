@@ -11,9 +11,9 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 
+from sb3_uav.common.callback_tree import siblings, walk_callbacks
 from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.training.callback_tree import siblings, walk_callbacks
 
 BEST_MODEL_FILE = "best_model.zip"
 BEST_ROUTER_FILE = "best_router.zip"

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import FIXED_SET_STREAM, random_stream
 from sb3_uav.common.sb3_compat import n_updates
@@ -20,7 +21,6 @@ from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, BestPair, BestPairOwner, best_model_folder, find_best_router, take_over
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, FixedSetResult
 from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem
 from sb3_uav.training.instance_sets import InstanceSets, InstanceSource, SizeTable
@@ -388,8 +388,14 @@ class FixedSetEvalCallback(BestPairOwner):
         self._report(result, improved)
         pause = self._now() - self._clock_start - seconds
         for callback in (self, *siblings(self, FixedSetEvalCallback)):
-            callback._clock_start = callback._clock_start + pause
+            callback.leave_out(pause)
         return self.last_mean_reward
+
+    def leave_out(self, pause: np.ndarray) -> None:
+        """
+        :param pause: ``(2,)``, wall and CPU seconds that are no training time, such as those of an evaluation
+        """
+        self._clock_start = self._clock_start + pause
 
     def _save_best_pair(self, folder: Path) -> None:
         router = None if self._its is None else self._its.router

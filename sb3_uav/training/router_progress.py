@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback, tqdm
 
-from sb3_uav.training.callback_tree import siblings
+from sb3_uav.common.callback_tree import siblings
 
 
 class RouterProgress(BaseCallback):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.random_streams import GRID_SEED
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.allocation import AllocationProblem
@@ -15,7 +16,6 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.training.best_pair import find_best_router
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set import TABLE_FILE, FixedSetEvalCallback
 from sb3_uav.training.instance_sets import InstanceSets
 
