@@ -52,7 +52,7 @@ def test_log_folder_is_the_zoos(trained):
     folder = run_folder(trained)
     assert folder.name == f"{ENV}_1"
     expected = {f"{ENV}.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv", ENV, "rl_model_320_steps.zip"}
-    ours = {"router.zip", "best_router.zip", "its_log.csv", "its_checkpoint"}
+    ours = {"router.zip", "best_router.zip", "best_pair.json", "its_log.csv", "its_checkpoint"}
     assert expected | ours == {path.name for path in folder.iterdir()}
     assert {path.name for path in (folder / ENV).iterdir()} == {"config.yml", "args.yml", "command.txt"}
     saved = yaml.load((folder / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)  # written by rl_zoo3 just now
@@ -60,7 +60,7 @@ def test_log_folder_is_the_zoos(trained):
     evaluations = np.load(folder / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [160, 320, 480] and evaluations["results"].shape == (3, 4)
     monitor = load_results(str(folder))
-    assert len(monitor) == 6 and (monitor["l"] == 20).all() and (monitor["r"] <= 20).all()
+    assert len(monitor) == 24 and (monitor["l"] == 20).all() and (monitor["r"] <= 20).all()
     assert list((trained / "tb").rglob("events.out.tfevents.*"))
 
 
@@ -126,7 +126,7 @@ def test_final_zip_continues_too(trained, tmp_path, capsys):
     lonely = tmp_path / "lonely.zip"
     lonely.write_bytes(final.read_bytes())
     assert run(tmp_path, config, "-i", str(lonely), "-n", str(EPOCH)) == 2
-    assert "holds its_state.json, which knows its router" in capsys.readouterr().err
+    assert "holds its_state.json, which names its router" in capsys.readouterr().err
     assert run(tmp_path, config, "-i", str(tmp_path / "none.zip")) == 2
     assert "none.zip: no such file; give the zip of a trained agent" in capsys.readouterr().err
 
