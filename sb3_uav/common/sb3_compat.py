@@ -6,12 +6,9 @@ Each function links the upstream code that it relies on.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 
 
 def n_updates(model: BaseAlgorithm) -> int:
@@ -62,16 +59,3 @@ def forget_last_observation(model: OnPolicyAlgorithm) -> None:
     :param model: An on-policy algorithm
     """
     model._last_obs = None
-
-
-def constructor_parameters(policy: BasePolicy) -> dict[str, Any]:
-    """
-    The constructor arguments of another policy of the same architecture.
-
-    ``BaseModel._get_constructor_parameters``, used by ``save`` and ``load`` of policies:
-    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/policies.py
-
-    :param policy: Any SB3 or sb3-contrib policy
-    :return: Keyword arguments for its class
-    """
-    return policy._get_constructor_parameters()

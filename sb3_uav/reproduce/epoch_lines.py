@@ -10,7 +10,7 @@ from types import TracebackType
 from sb3_uav.reproduce.pair_training import PairTraining
 
 # Seconds between two reads of the logs of running trainings.
-POLL_INTERVAL = 1.0
+_POLL_INTERVAL = 1.0
 
 
 class EpochLines:
@@ -39,7 +39,7 @@ class EpochLines:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._over.wait(POLL_INTERVAL):
+        while not self._over.wait(_POLL_INTERVAL):
             self._look()
         self._look()
 

@@ -122,7 +122,7 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
             self._flatten()
         fragments = np.random.permutation(self._n_fragments)
         lengths = np.diff(self._starts)[fragments]
-        for chosen in split_evenly(lengths, batch_size or len(self._fragments)):
+        for chosen in _split_evenly(lengths, batch_size or len(self._fragments)):
             yield self._get_samples(np.concatenate([np.arange(*self._starts[i : i + 2]) for i in fragments[chosen]]))
 
     def _flatten(self) -> None:
@@ -152,7 +152,7 @@ class MaskableEpisodeRolloutBuffer(EpisodeRolloutBuffer, MaskableDictRolloutBuff
     step_fields = (*EpisodeRolloutBuffer.step_fields, "action_masks")
 
 
-def split_evenly(lengths: np.ndarray, batch_size: int) -> list[np.ndarray]:
+def _split_evenly(lengths: np.ndarray, batch_size: int) -> list[np.ndarray]:
     """
     Cut a sequence of fragments into runs of about equally many steps.
 
