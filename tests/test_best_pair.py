@@ -53,7 +53,8 @@ class Forget(BaseCallback):
 def evaluation(folder: Path, kind: Any = EvalCallback, **kwargs: Any) -> Any:
     settings: dict[str, Any] = dict(n_eval_episodes=2, eval_freq=7, verbose=0, best_model_save_path=str(folder))
     if kind is TrialEvalCallback:
-        made = kind(make_env(2), Trial(), n_eval_episodes=2, eval_freq=7, best_model_save_path=str(folder))
+        trial: Any = Trial()
+        made = kind(make_env(2), trial, n_eval_episodes=2, eval_freq=7, best_model_save_path=str(folder))
         made.callback = Forget()
         made.callback.parent = made
         return made

@@ -178,7 +178,7 @@ def test_same_callback_goes_on_without_files():
 
 @pytest.mark.parametrize("change", [dict(n_samples=2), dict(seed=1), dict(n_instances=7)])
 def test_other_sets_are_not_continued(change, tmp_path):
-    """But steps are counted on, and the model still knows where those of the earlier set are."""
+    """Steps are still counted from the start, and the model keeps the folder of the earlier set."""
     model = make_model(PPO)
     model.learn(ROLLOUT, callback=make_callback(tmp_path / "one"))
     model.learn(ROLLOUT, callback=make_callback(tmp_path / "other", **change))

@@ -40,7 +40,7 @@ def test_several_sizes_are_evaluated_set_after_set(tmp_path):
     # From the files alone.
     policy, problem = load_policy(tmp_path / "best_model.zip"), allocation_env().problem
     parts = [Instances.load(tmp_path / f"evaluation_instances-{name}.npz") for name in ("U2-N9", "U3-N12")]
-    again = [evaluate_fixed_set(policy, problem, part, 0).greedy for part in parts]  # type: ignore[arg-type]
+    again = [evaluate_fixed_set(policy, problem, part, 0).greedy for part in parts]
     assert np.array_equal(np.concatenate(again), history.results[int(np.argmax([row["score"] for row in rows]))])
 
 
@@ -182,15 +182,13 @@ def test_default_dtype_and_device_do_not_matter():
     policy, problem = make_model(policy_kwargs=NETWORK).policy, allocation_env().problem
     instances = draw_fixed_set(problem, 5, 0)
     expected = evaluate_fixed_set(policy, problem, instances, 3)
-    for set_default, value, usual in (
-        (th.set_default_dtype, th.float64, th.float32),
-        (th.set_default_device, "meta", "cpu"),
-    ):
-        set_default(value)  # type: ignore[operator]
+    defaults: list[Any] = [(th.set_default_dtype, th.float64, th.float32), (th.set_default_device, "meta", "cpu")]
+    for set_default, value, usual in defaults:
+        set_default(value)
         try:
             found = evaluate_fixed_set(policy, problem, draw_fixed_set(problem, 5, 0), 3)
             drawn = InstanceSets.draw(SIZES, 1.5, lambda n_uavs, n_tasks: np.random.default_rng([n_uavs, n_tasks]))
         finally:
-            set_default(usual)  # type: ignore[operator]
+            set_default(usual)
         assert np.array_equal(found.greedy, expected.greedy) and np.array_equal(found.sampled, expected.sampled)
         assert {part.tasks.dtype for part in drawn.sets.values()} == {th.float64}

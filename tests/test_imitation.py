@@ -47,7 +47,7 @@ def test_tours_are_feasible_and_good() -> None:
 
 
 def test_a_router_learns_by_imitation(allocator: Any) -> None:
-    """Greedy tours over new instances. Without geometry it knows nothing at first."""
+    """Greedy tours over new instances. Without geometry an untrained router is poor."""
     router = make_policy(RouterPolicy, geometry=False)
     instances = allocator.arrange(UniformGenerator(60, 4)(24, np.random.default_rng(7)))
     assignment = allocator.decode_episodes(instances)
@@ -246,7 +246,7 @@ def make_model() -> REINFORCE:
 
 
 def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """The router has learned before the allocator begins; a run that goes on does not begin anew."""
+    """The router has learned before the allocator begins; a resumed run does not repeat it."""
     make_model().learn(10**9, callback=make_its(save_path=str(tmp_path), verbose=1))
     assert "imitation: 4 of 4 updates" in capsys.readouterr().out
     state = read_state(tmp_path / CHECKPOINT_FOLDER)
@@ -258,7 +258,7 @@ def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[st
 
 @pytest.mark.parametrize("room", ["training", "solvers"])
 def test_its_goes_on_with_it(room: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that was interrupted in its warm start goes on in another folder, and ends as if it had not been interrupted."""
+    """A run that was interrupted in its warm start resumes in another folder, and ends like an uninterrupted one."""
     monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
     expected = make_its(save_path=str(tmp_path / "expected"))
     make_model().learn(10**9, callback=expected)

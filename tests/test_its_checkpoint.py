@@ -66,7 +66,7 @@ class Interrupt(BaseCallback):
 @pytest.mark.parametrize("baseline", ["exponential", "rollout"])
 @pytest.mark.parametrize("epochs", [0, 1, 2, 3, 5])
 def test_resumed_run_equals_an_unbroken_one(baseline, epochs, tmp_path):
-    """Interrupted in any phase, after pre-training included: allocator, router and log go on as if nothing had happened."""
+    """Interrupted in any phase, after pre-training included: allocator, router and log equal those of an unbroken run."""
     settings: dict[str, Any] = dict(baseline=baseline, policy_kwargs=PAPER, lr_decay=0.9)
     router: dict[str, Any] = dict(baseline=baseline, lr_decay=0.9, policy_kwargs=PAPER)
     if baseline == "rollout":

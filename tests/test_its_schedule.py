@@ -3,6 +3,7 @@
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 from its_runs import N_TASKS, N_UAVS, SMALL, equal, learn, make_allocator, make_env, make_its, snapshot, trace
 from stable_baselines3 import PPO
@@ -89,7 +90,7 @@ def test_batches_that_end_one_epoch_or_two():
 
 @pytest.mark.parametrize("at", range(1, 6))
 def test_resumed_between_two_epochs_of_a_batch(at, tmp_path, monkeypatch):
-    """The checkpoint knows fewer epochs than the allocator has finished."""
+    """The checkpoint has fewer epochs than the allocator has completed."""
 
     def make() -> tuple[Any, Any]:
         model = REINFORCE(
@@ -126,7 +127,8 @@ def test_resumed_between_two_epochs_of_a_batch(at, tmp_path, monkeypatch):
 
 def test_all_epochs_happen_under_ppo_too():
     """A rollout of 16 instances, 4 in an epoch."""
-    model: Any = PPO(
+    algorithm: Any = PPO
+    model = algorithm(
         AllocatorPolicy, make_env(8), n_steps=2 * N_TASKS, batch_size=20, n_epochs=1, policy_kwargs=SMALL, seed=0, device="cpu"
     )
     its = make_its(n_epochs=6, n_pretraining_epochs=1, n_intensive_epochs=2, instances_per_epoch=4)
@@ -171,6 +173,6 @@ def test_the_routers_subsets_are_sampled_from_the_allocator(monkeypatch):
     rows = sum(len(subsets.draw_batch(batch)) for batch in subsets.batches) * N_UAVS
     monkeypatch.undo()
     for _ in range(2):
-        drawn = subsets(rows, None)  # type: ignore[arg-type]
+        drawn = subsets(rows, np.random.default_rng(0))
         passes.append({tuple(map(tuple, drawn.tasks[row][drawn.task_mask[row]].tolist())) for row in range(rows)})
     assert passes[0] != passes[1]

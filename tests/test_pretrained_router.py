@@ -68,5 +68,5 @@ def test_pretrained_router_is_checked(tmp_path):
     with pytest.raises(ValueError, match="needs a TaskAllocation environment"):
         make_model(PPO, "routing").learn(ROLLOUT, callback=PretrainedRouterCallback(tmp_path / "router.zip"))
     its = ITSCallback(dict(policy="RouterPolicy", policy_kwargs=NETWORK), save_path=str(tmp_path))
-    with pytest.raises(ValueError, match="both bring a router"):
+    with pytest.raises(ValueError, match="both provide a router"):
         make_model(REINFORCE).learn(ROLLOUT, callback=[PretrainedRouterCallback(tmp_path / "router.zip"), its])

@@ -17,6 +17,10 @@ from sb3_uav.training.router_trainer import RouterTrainer
 pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
 
 
+# SB3 declares other policies than ours.
+make_ppo: Any = PPO
+
+
 class Mine(REINFORCE):
     """A user's own algorithm."""
 
@@ -93,7 +97,7 @@ def test_settings_that_are_not_the_users_are_refused(router, message):
 def test_the_routers_default_batch_fits_its_epochs():
     """As many environments as the allocator's, but not more than an epoch has instances."""
     settings = dict(n_epochs=2, n_pretraining_epochs=1, n_intensive_epochs=0, router_instances_per_epoch=3)
-    its = ITSCallback(dict(policy="RouterPolicy", policy_kwargs=SMALL), **settings)  # type: ignore[arg-type]
+    its: Any = ITSCallback(dict(policy="RouterPolicy", policy_kwargs=SMALL), **settings)  # type: ignore[arg-type]
     learn(make_allocator(), its)
     assert its.router.n_envs == 3 and its.router.n_instances == 3 * 3
 
@@ -162,7 +166,7 @@ def test_unseeded_runs_of_sb3s_algorithms_differ(algorithm, tmp_path):
 
 
 def test_a_seeded_run_keeps_its_streams():
-    model: Any = PPO(AllocatorPolicy, make_env(), n_steps=5, batch_size=10, seed=3, policy_kwargs=SMALL, device="cpu")
+    model = make_ppo(AllocatorPolicy, make_env(), n_steps=5, batch_size=10, seed=3, policy_kwargs=SMALL, device="cpu")
     its = make_its(n_epochs=1, n_pretraining_epochs=0, instances_per_epoch=8)
     model.learn(200, callback=its)
     assert model.stream_seed == 3

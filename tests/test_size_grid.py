@@ -89,7 +89,7 @@ def test_errors_name_what_is_wrong() -> None:
 
 
 def test_a_resumed_run_keeps_the_best_pair_and_the_history(tmp_path: Path) -> None:
-    """Also when it goes on in a folder of its own, as the zoo's do."""
+    """Also when it resumes in a folder of its own, as the zoo's runs do."""
     fixed, _ = train(tmp_path / "first")
     best = {name: (tmp_path / "first" / name).read_bytes() for name in ("best_allocator.zip", "best_router.zip")}
     checkpoint = tmp_path / "first" / "its_checkpoint"

@@ -33,8 +33,8 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
     An episode that ``n_steps`` cuts in two is stored as two fragments, each with its own copy of the static part; so is one
     whose static part a wrapper changes on the way, as ``VecNormalize`` does. Advantages are SB3's. Samples differ from those
     of SB3 in their observations: static keys have one row per fragment of the minibatch, and ``episode_index`` ``(batch,)``
-    int64 says which of them belongs to each step. ``MultiInputPolicy`` does not know that key and stops with a ``KeyError``:
-    leave SB3's own buffer to it.
+    int64 says which of them belongs to each step. ``MultiInputPolicy`` has no extractor for that key and raises
+    ``KeyError``; use SB3's own buffer with it.
 
     :param buffer_size: Max number of element in the buffer
     :param observation_space: Observation space of one of our environments

@@ -1,4 +1,4 @@
-"""Evaluation on fixed instances during training, so that the best model is that of more than a lucky draw."""
+"""Evaluation on fixed instances during training, so that the best model is chosen by more than a lucky draw."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, BestPair, BestPairOwner, best_model_folder, find_best_router, take_over
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, FixedSetResult
 from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem
@@ -91,10 +92,10 @@ class FixedSetEvalCallback(BestPairOwner):
     :raises ValueError: If an argument is not allowed; the message names it
     """
 
-    # Beside which no other callback of the same names can write.
+    # Two callbacks with the same name here cannot share a folder.
     results_file: ClassVar[str] = RESULTS_FILE
     instances_file: ClassVar[str | None] = INSTANCES_FILE
-    # Further names of the best model's zip.
+    # Additional names for a copy of the best model.
     best_copies: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
@@ -112,15 +113,8 @@ class FixedSetEvalCallback(BestPairOwner):
         eval_updates: int | None = None,
     ) -> None:
         super().__init__(verbose)
-        for name, value, least in (
-            ("n_instances", n_instances, 1),
-            ("seed", seed, 0),
-            ("n_samples", n_samples, 0),
-            ("eval_freq", 1 if eval_freq is None else eval_freq, 1),
-            ("eval_updates", 1 if eval_updates is None else eval_updates, 1),
-        ):
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
+        check_counts(1, n_instances=n_instances, eval_freq=eval_freq, eval_updates=eval_updates)
+        check_counts(0, seed=seed, n_samples=n_samples)
         if best_by not in ("greedy", "sampled"):
             raise ValueError(f"best_by is {best_by!r}; choose 'greedy' or 'sampled'.")
         if best_by == "sampled" and n_samples == 0:
@@ -233,12 +227,12 @@ class FixedSetEvalCallback(BestPairOwner):
 
     @property
     def _state(self) -> dict[str, Any]:
-        """The model's record of its training: steps and seconds, and the folder of each set's evaluations."""
+        """The model's own record: steps and seconds of training, and the folder of the evaluations of each set."""
         return getattr(self.model, STATE, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
 
     def _note_state(self, seconds: np.ndarray) -> None:
         """
-        Keep in the model what a zip of it must hold for a training that continues.
+        Store in the model what its zip must hold to resume the evaluations.
 
         :param seconds: Wall and CPU seconds of the training
         """
@@ -274,7 +268,7 @@ class FixedSetEvalCallback(BestPairOwner):
             return
         self.history = recorded.until(timesteps)
         scores = self._scores(recorded)
-        # The best zip may be of a time after that of the zip whose training continues; then it is none of this run.
+        # The best zip may be more recent than the zip that is being trained further; then it is not of this run.
         if len(self.history.timesteps) == 0 or int(scores.argmax()) >= len(self.history.timesteps):
             return
         self.best_mean_reward = float(scores.max())
@@ -406,7 +400,7 @@ class FixedSetEvalCallback(BestPairOwner):
         values = self.history.results if self.best_by == "greedy" else self.history.sampled
         means = {name: float(mean[-1]) for name, mean in sets.means(values).items()}
         row = {"updates": n_updates(self.model), "seconds": round(float(seconds[0]), 1), **means}
-        # A row of the same update is replaced: an earlier run may have evaluated it, too.
+        # Replace a row of the same update, which an earlier run may have evaluated too.
         earlier = [old for old in self.table.rows if old["updates"] < row["updates"]]
         self.table = SizeTable([*earlier, {**row, "score": self.last_mean_reward}])
         for name, mean in means.items():

@@ -74,7 +74,7 @@ class EvaluationHistory(NamedTuple):
     def append(self, timesteps: int, result: FixedSetResult, seconds: np.ndarray) -> EvaluationHistory:
         """
         :param timesteps: Steps learned from
-        :param result: Of the evaluation
+        :param result: Result of the evaluation
         :param seconds: Wall and CPU seconds of the training
         :return: This history and one more evaluation
         """
@@ -110,7 +110,7 @@ class EvaluationHistory(NamedTuple):
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; give the {RESULTS_FILE} that FixedSetEvalCallback wrote.")
-        arrays = read_npz(path, "delete it and evaluate anew")
+        arrays = read_npz(path, "delete it and evaluate again")
         missing = set(cls._fields) - set(arrays)
         if missing:
             raise ValueError(f"{path}: arrays {sorted(missing)} are missing; it was not written by FixedSetEvalCallback.")

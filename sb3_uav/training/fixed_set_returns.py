@@ -13,15 +13,15 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.training.fixed_set_history import FixedSetResult
 
-# How many instances are decoded at once: the smaller of the paper's batches.
+# Number of instances decoded at once: the smaller of the paper's batch sizes.
 CHUNK_ROWS = 256
 
 
 def draw_fixed_set(problem: Problem, n_instances: int, seed: int) -> Instances:
     """
-    :param problem: Whose instances to draw
-    :param n_instances: How many
-    :param seed: Which of the sets; the same one whatever the seed of a training, and disjoint from the instances of any
+    :param problem: The problem that the instances are for
+    :param n_instances: Number of instances
+    :param seed: Seed for drawing them. No training draws the same instances, whatever its seed
     :return: The instances, on the CPU
     """
     return problem.generator(n_instances, random_stream(seed, FIXED_SET_STREAM))
@@ -36,11 +36,11 @@ def evaluate_fixed_set(
     Global random states and the policy's mode stay as they are; the samples come from the same numbers every time.
 
     :param policy: The policy
-    :param problem: What it plays; its router, if any, plans the tours
+    :param problem: The problem; its router, if any, plans the tours
     :param instances: The set, on the CPU
     :param n_samples: Samples per instance; 0 for none
-    :param seed: Of the samples
-    :return: What it achieves
+    :param seed: Seed for sampling
+    :return: Its returns
     """
     was_training = policy.training
     policy.set_training_mode(False)

@@ -1,4 +1,4 @@
-"""A good start for the router: imitation of the tours that local search finds for the subsets of an allocator."""
+"""Imitation: training the router on the tours that local search finds for the subsets of an allocator."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.symmetries import turn
 from sb3_uav.local_search.search import LocalSearch
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.imitation_progress import ImitationProgress, Lesson
 
-# A batch holds as many subsets of so many tasks as it is said to have; of larger ones fewer.
+# Number of tasks of a subset for which a batch holds exactly batch_size subsets; of larger subsets it holds fewer.
 TYPICAL_SIZE = 30
-# Trials of the search per task: with 12, tours had 99 % of the tasks that 25 times as long a search found.
+# Trials of the search per task. With 12, tours visit 99 % of the tasks that a search 25 times as long visits.
 TRIALS_PER_TASK = 12
 WARM_UP = 50
 LAST_RATE = 0.02
 MAX_GRAD_NORM = 1.0
 REPORT_EVERY = 250
-# After so many updates, and so many tours, progress is saved.
+# Progress is saved every SAVE_EVERY updates and every CHUNK_SIZE tours.
 SAVE_EVERY = 500
 CHUNK_SIZE = 10_000
 
@@ -49,27 +50,25 @@ def imitate(
     """
     Train a router on the tours of local search, by the likelihood of their moves.
 
-    The subsets are what the allocator gives to the UAVs when it is sampled; it may be untrained. Every tour is shown in both
-    directions and turned around the depot by any angle.
+    The subsets are sampled from the allocator, which may be untrained. Tours are reversed and rotated around the
+    depot at random.
 
     :param router: The policy to train, in place
     :param allocator: Splits the tasks
-    :param generator: Draws the instances; all values should be equal, as a tour that ends early is not understood
-    :param rng: The source of all randomness
-    :param n_subsets: How many subsets to search tours for
-    :param n_updates: How many gradient steps to take; the rate rises for a few, then falls like a cosine
-    :param batch_size: Subsets of an update, if they have 30 tasks; of larger ones it takes fewer
-    :param learning_rate: The highest rate of Adam
-    :param report: Is told how far it is
-    :param folder: Where to keep the progress; what is there is gone on from, with the same result as without an interruption
-        if everything else is the same
+    :param generator: Draws the instances; all task values should be equal, because the tours visit as many tasks as possible
+    :param rng: Random generator for everything that is drawn
+    :param n_subsets: Number of subsets to search tours for
+    :param n_updates: Number of gradient steps; the learning rate warms up, then follows a cosine
+    :param batch_size: Subsets per update if they have 30 tasks; fewer if they are larger
+    :param learning_rate: Peak learning rate of Adam
+    :param report: Called with a line of text about the progress
+    :param folder: Folder for the progress. Calling again with the same arguments resumes from it, with the same result as
+        without an interruption
     :raises ImportError: If numba is not installed
     :raises OSError: If the progress cannot be written
     :raises ValueError: If a number is not above 0, or the folder holds the progress of other settings or damaged files
     """
-    for name, value in (("n_subsets", n_subsets), ("n_updates", n_updates), ("batch_size", batch_size)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1.")
+    check_counts(1, n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size)
     if not learning_rate > 0:
         raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
     settings = dict(n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size, learning_rate=learning_rate)
@@ -78,7 +77,7 @@ def imitate(
     optimizer = th.optim.Adam(router.parameters(), learning_rate)
     n_done = 0 if progress is None else progress.restore_updates(router, optimizer, rng)
     if n_done > 0:
-        report(f"imitation: goes on after {n_done} of {n_updates} updates")
+        report(f"imitation: resumed after {n_done} of {n_updates} updates")
     start, total, n_moves = time.perf_counter(), th.zeros((), dtype=th.float32, device=router.device), 0
     router.set_training_mode(True)
     for update in range(n_done + 1, n_updates + 1):
@@ -117,12 +116,12 @@ def search_lessons(
     """
     :param allocator: Splits the tasks
     :param generator: Draws the instances
-    :param rng: The source of randomness
-    :param n_subsets: How many subsets there shall be at least
+    :param rng: Random generator
+    :param n_subsets: Smallest number of subsets in all
     :param batch_size: As for :func:`imitate`
-    :param report: Is told how far it is
-    :param progress: Keeps what was found, and knows what was found before
-    :return: Subsets of similar sizes, with tours
+    :param report: Called with a line of text about the progress
+    :param progress: Where tours are saved and restored
+    :return: Batches of subsets with their tours
     """
     start = time.perf_counter()
     lessons = [] if progress is None else progress.restore_lessons(rng)
@@ -149,7 +148,7 @@ def search_lessons(
 def good_tours(subsets: Instances) -> th.Tensor:
     """
     :param subsets: ``batch`` single-UAV instances
-    :return: ``(batch, n_steps)`` int64 nodes, padded with the depot: tours that local search finds in some milliseconds
+    :return: ``(batch, n_steps)`` int64 nodes, padded with the depot: tours from a local search of a few milliseconds
     """
     routes = []
     for row in range(len(subsets)):
@@ -164,9 +163,9 @@ def good_tours(subsets: Instances) -> th.Tensor:
 def varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
     """
     :param lesson: Subsets and tours
-    :param rng: The source of randomness
+    :param rng: Random generator
     :param batch_size: As for :func:`imitate`
-    :return: Some of them, half of them backwards, each turned around its depot
+    :return: A random selection, about half of the tours reversed, each instance rotated around its depot
     """
     instances, tours = lesson
     rows = rng.permutation(len(instances))[: max(batch_size * TYPICAL_SIZE // instances.n_tasks, 4)]

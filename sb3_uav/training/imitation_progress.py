@@ -1,4 +1,4 @@
-"""The files that an interrupted imitation goes on from."""
+"""The files from which an interrupted imitation resumes."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Lesson(NamedTuple):
 
 class ImitationProgress:
     """
-    Lessons and updates so far, as plain tensors: nothing in the files is executed when they are read.
+    Lessons and updates so far, stored as plain tensors: nothing in the files is executed when they are read.
 
-    :param folder: Where the files are, or are going to be
-    :param settings: Of the imitation; the files must have been written with the same, and for the same generator and seed
+    :param folder: Folder of the files
+    :param settings: Settings of the imitation; the files must have been written with the same settings, generator and seed
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
@@ -45,11 +45,11 @@ class ImitationProgress:
 
     def save_lessons(self, lessons: list[Lesson], rng: np.random.Generator) -> None:
         """
-        :param lessons: New ones
-        :param rng: What they were drawn from
+        :param lessons: New lessons
+        :param rng: The generator they were drawn from
         :raises OSError: If the file cannot be written
         """
-        # Copies, because torch saves all that a view is a part of.
+        # Copies, because torch saves the whole storage of a view.
         content = [
             {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in INSTANCE_FIELDS}
             for lesson in lessons
@@ -59,8 +59,8 @@ class ImitationProgress:
 
     def restore_lessons(self, rng: np.random.Generator) -> list[Lesson]:
         """
-        :param rng: Goes on where it was when the last ones were saved
-        :return: All that were saved
+        :param rng: Set to its state when the last lessons were saved
+        :return: All saved lessons
         :raises ValueError: If a file is damaged or belongs to other settings
         """
         lessons: list[Lesson] = []
@@ -76,10 +76,10 @@ class ImitationProgress:
         self, n_updates: int, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator
     ) -> None:
         """
-        :param n_updates: How many were made
-        :param router: What has learned
+        :param n_updates: Number of updates so far
+        :param router: The policy in training
         :param optimizer: Its optimizer
-        :param rng: What chose the lessons
+        :param rng: The generator that selects lessons
         :raises OSError: If the file cannot be written
         """
         learned = {"n_updates": n_updates, "router": router.state_dict(), "optimizer": optimizer.state_dict()}
@@ -87,10 +87,10 @@ class ImitationProgress:
 
     def restore_updates(self, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator) -> int:
         """
-        :param router: Gets what was learned
-        :param optimizer: Gets its state
-        :param rng: Goes on where it was
-        :return: How many updates were made
+        :param router: Receives the saved parameters
+        :param optimizer: Receives the saved state
+        :param rng: Set to its saved state
+        :return: Number of saved updates
         :raises ValueError: If the file is damaged or belongs to other settings or another network
         """
         path = self.folder / "updates.pt"
@@ -123,7 +123,7 @@ class ImitationProgress:
             content = th.load(stored, map_location="cpu", weights_only=True)
             state, settings = json.loads(content["rng"]), content["settings"]
         except Exception as error:
-            # Torch raises all kinds of them.
+            # Torch raises exceptions of many kinds here.
             raise self._damaged(path, error) from error
         if settings != self.settings:
             raise ValueError(

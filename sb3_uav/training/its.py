@@ -23,6 +23,7 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.freezing import Freezer
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.recognition import find_problem
+from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import RouterCallback, take_over
 from sb3_uav.training.its_checkpoint import (
     CHECKPOINT_FOLDER,
@@ -54,8 +55,8 @@ class ITSCallback(RouterCallback):
     part of them (alternate training).
 
     The router is saved after each of its epochs, and a checkpoint of both levels after each epoch of pre-training and every
-    ``checkpoint_freq``-th one of the allocator. With ``REINFORCE`` and constant learning rates (``lr_decay`` included) a run
-    goes on from its checkpoint with the same result as if it had not been interrupted.
+    ``checkpoint_freq``-th one of the allocator. With ``REINFORCE`` and constant learning rates (``lr_decay`` included) a
+    resumed run ends with the same result as an uninterrupted one.
 
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
@@ -70,7 +71,7 @@ class ITSCallback(RouterCallback):
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
-    :param router_instances_per_epoch: Instances of a router epoch, where they shall be others than those of the allocator
+    :param router_instances_per_epoch: Instances of a router epoch, where it differs from that of the allocator
     :param strategy: ``"its"``, or one of the paper's ablations: ``"no-pretraining"``, ``"no-intensive"``,
         ``"alternate-only"`` (neither), ``"independent"`` (DL-DRL-I: the router is only pre-trained, for as many epochs as
         ``"its"`` would train it in all). The paper's names (``"ITS/pre-training"`` for training without it, and so on) mean
@@ -99,17 +100,9 @@ class ITSCallback(RouterCallback):
         warm_start: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(verbose)
-        for name, value, least in (
-            ("n_epochs", n_epochs, 1),
-            ("n_pretraining_epochs", n_pretraining_epochs, 0),
-            ("n_intensive_epochs", n_intensive_epochs, 0),
-            ("n_continuous_epochs", n_continuous_epochs, 1),
-            ("checkpoint_freq", checkpoint_freq, 1),
-            ("instances_per_epoch", 1 if instances_per_epoch is None else instances_per_epoch, 1),
-            ("router_instances_per_epoch", 1 if router_instances_per_epoch is None else router_instances_per_epoch, 1),
-        ):
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
+        check_counts(1, n_epochs=n_epochs, n_continuous_epochs=n_continuous_epochs, checkpoint_freq=checkpoint_freq)
+        check_counts(0, n_pretraining_epochs=n_pretraining_epochs, n_intensive_epochs=n_intensive_epochs)
+        check_counts(1, instances_per_epoch=instances_per_epoch, router_instances_per_epoch=router_instances_per_epoch)
         if not isinstance(router, dict) or "policy" not in router:
             raise ValueError(f"router must be a mapping with at least the key 'policy', found {router!r:.80}.")
         self.strategy = strategy_name(strategy)
@@ -160,12 +153,12 @@ class ITSCallback(RouterCallback):
         if self.save_path is None:
             self.save_path = self._find_save_path()
         if not self._started:
-            # Before anything is drawn or saved, so that an unseeded run has streams of its own, and keeps them.
+            # Before anything is drawn or saved, so that an unseeded run draws a seed and every zip of it has that seed.
             self._seed()
             self._warn_of_large_batches()
             self._set_up_router()
             self._started = True
-        # SB3's algorithms count steps only, and may start again from 0: what they have learned from is counted from here.
+        # SB3's algorithms only count steps, which may start again from 0, so instances are counted from here.
         self._instances_before = self.epoch * self.instances_per_epoch
         self._steps_before = self.model.num_timesteps
         hand_over_router(self, self._trainer.plan)
@@ -197,7 +190,7 @@ class ITSCallback(RouterCallback):
         return size
 
     def _set_up_router(self) -> None:
-        """Make the router, continue an earlier run if there is one, and let the warm start do its part."""
+        """Create the router, restore an earlier run if there is one, and run the warm start."""
         assert self.instances_per_epoch is not None
         self._trainer = RouterTrainer(
             self.router_kwargs,
@@ -213,7 +206,7 @@ class ITSCallback(RouterCallback):
             self._resume(self.resume_from)
         elif n_updates(self.model) > 0:
             raise ValueError(
-                "The allocator has been trained before, but ITSCallback does not know its router: set resume_from to the "
+                "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
                 f"{CHECKPOINT_FOLDER} folder of the earlier run."
             )
         if self.warm_start is not None and not self._warm_started:
@@ -273,7 +266,7 @@ class ITSCallback(RouterCallback):
         self._epoch_start = time.time()
         n_batches = getattr(self.model, "n_batches", 0)
         if self._epoch_is_over():
-            # The last batch held this epoch, too: they share its episodes and its instances.
+            # The last batch also completed this epoch; both share its episodes and its instances.
             self._instances_at_start = self.epoch * self.instances_per_epoch
             self._epoch_first_batch = max(n_batches - 1, 0)
         else:
@@ -290,7 +283,7 @@ class ITSCallback(RouterCallback):
         return self.epoch < self.n_epochs
 
     def _on_training_end(self) -> None:
-        # rl_zoo3 calls this a second time, and after Ctrl-C, when training the router for an epoch is not wanted.
+        # rl_zoo3 calls this a second time, and after Ctrl-C, when the router must not start another epoch.
         if not self._started:
             return
         if self.model.num_timesteps >= total_timesteps(self.model):
@@ -332,7 +325,7 @@ class ITSCallback(RouterCallback):
         if isinstance(self.model, REINFORCE):
             first, draw_batch = self._epoch_first_batch, self.model.draw_batch
         else:
-            # SB3's algorithms do not replay instances: new ones of the same distribution.
+            # SB3's algorithms cannot replay their instances; draw new ones from the same distribution.
             first, n_batches, draw_batch = 0, self._batches_per_epoch(), self._draw_new_batch
         self._subsets = AllocatedSubsets(
             self.model.policy,
@@ -361,7 +354,7 @@ class ITSCallback(RouterCallback):
         return self.model.policy.arrange(training_batch(self.problem.generator, self.training_env.num_envs, rng))
 
     def _seed(self) -> int:
-        """The seed of the streams that router and allocator do not have themselves; the allocator's zips keep it."""
+        """Seed of the streams for warm start and router instances, saved in the allocator's zips."""
         return stream_seed(self.model)
 
     def _train_router(self, n_epochs: int, phase: str, first: int = 0) -> None:
@@ -422,7 +415,7 @@ class ITSCallback(RouterCallback):
         state = read_state(folder)
         check_allocator(folder, state, self.model)
         self.epoch = state["epoch"]
-        # Without it, the state was written when there was no checkpoint before the end of the warm start.
+        # Versions that did not write this field saved no checkpoint before the end of the warm start.
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         self._trainer.load(folder / state["router"])

@@ -150,7 +150,7 @@ def check_allocator(folder: Path, state: dict[str, Any], allocator: BaseAlgorith
     noted = noted if isinstance(noted, dict) else {}
     epoch = noted.get("epoch", state["epoch"])
     if isinstance(allocator, REINFORCE) and noted.get("n_instances") != allocator.n_instances:
-        # Another zip than that of the checkpoint: it must not have finished another epoch since.
+        # Not the zip of the checkpoint itself: it must not have completed another epoch since.
         epoch = allocator.epoch
     if epoch != state["epoch"]:
         raise ValueError(

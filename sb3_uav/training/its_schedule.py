@@ -1,4 +1,4 @@
-"""Which epochs the interactive training strategy has (paper, section IV-C, Algorithm 1 and Fig. 5)."""
+"""The schedule of epochs of the interactive training strategy (paper, section IV-C, Algorithm 1 and Fig. 5)."""
 
 from __future__ import annotations
 

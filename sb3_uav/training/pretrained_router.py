@@ -21,7 +21,7 @@ from sb3_uav.training.run_folder import find_run_folder
 
 class PretrainedRouterCallback(BaseCallback):
     """
-    Lets the rewards of the allocator's training come from a router that does not learn.
+    Computes the rewards of the allocator's training with a router that does not learn.
 
     It is handed to the training environment and to that of SB3's ``EvalCallback``, and copied into the run folder, where
     ``sb3_uav.zoo.enjoy`` finds it. Without this callback or ``ITSCallback``, the UAVs fly to the nearest task. In the YAML of
@@ -47,7 +47,7 @@ class PretrainedRouterCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if siblings(self, ITSCallback):
-            raise ValueError("PretrainedRouterCallback and ITSCallback both bring a router; use one of them.")
+            raise ValueError("PretrainedRouterCallback and ITSCallback both provide a router; use one of them.")
         if not isinstance(evaluated_problem(self.training_env), AllocationProblem):
             raise ValueError(f"PretrainedRouterCallback needs a TaskAllocation environment, found {self.training_env}.")
         with undisturbed_random_state():

@@ -27,9 +27,9 @@ from sb3_uav.reinforce.algorithms import resolve_algorithm
 from sb3_uav.training.episode_buffer import use_episode_buffer
 from sb3_uav.training.subsets import WholeInstances
 
-# Settings of the router that follow from the environment, or that its zip decides when a run is resumed.
+# Settings that follow from the environment, or that the router's zip decides when a run is resumed.
 _NOT_RELOADED = {"algo", "n_envs", "policy", "policy_kwargs", "seed", "device", "instances_per_epoch"}
-# Arguments of algorithms that are not the user's here.
+# Arguments of algorithms that cannot be set here, and why.
 _REFUSED = {
     "env": "ITSCallback makes the router's environment from the allocator's; set n_envs for its size",
     "tensorboard_log": "the router logs beside the allocator, in the folder 'router' of its TensorBoard events",
@@ -120,7 +120,7 @@ class RouterTrainer:
     def _prepare(self) -> None:
         """Give the router its epochs and the buffer of whole episodes, and reset its environment."""
         if isinstance(self.algorithm, REINFORCE):
-            # Not in the constructor, which a subclass may have changed.
+            # Set here, because the constructor of a subclass may not have this argument.
             self.algorithm.instances_per_epoch = self.epoch_size
         is_stock_buffer = type(self.algorithm.rollout_buffer) in (DictRolloutBuffer, MaskableDictRolloutBuffer)
         if is_stock_buffer and not isinstance(self.algorithm, REINFORCE):
@@ -143,7 +143,7 @@ class RouterTrainer:
         callback = CallbackList([statistics, *others])
         if isinstance(self.algorithm, REINFORCE):
             before = self.algorithm.n_instances
-            # Up to a multiple of the epoch's size, so that whole batches do not add up to more epochs than there are.
+            # Up to a multiple of the epoch's size, so that rounding up to whole batches does not add epochs.
             self.algorithm.learn_instances(number * self.epoch_size - before, callback)
             return self.algorithm.n_instances - before
         # SB3 keeps the last observation of the previous generator's instances otherwise.

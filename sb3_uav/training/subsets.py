@@ -15,13 +15,13 @@ from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, trainin
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import AllocatorPolicy
 
-# How many instances of a test are allocated at once: the smaller of the paper's batches.
+# Number of test instances allocated at once: the smaller of the paper's batch sizes.
 HELD_OUT_ROWS = 256
 
 
 class SingleUavGenerator:
     """
-    What generators of the router's instances have in common: one UAV, and the size of the fleet's instances.
+    Base of the generators of the router's instances: one UAV, and as many tasks as the fleet's instances.
 
     :param generator: Draws the instances of the fleet
     """
@@ -44,7 +44,7 @@ class WholeInstances(SingleUavGenerator):
         return replace(self.generator(batch_size, rng), n_uavs=1)
 
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
-        """The same of the instances that the generator prefers to train on."""
+        """The same for the generator's training batches."""
         return replace(training_batch(self.generator, batch_size, rng), n_uavs=1)
 
 
@@ -54,14 +54,14 @@ class AllocatedSubsets(SingleUavGenerator):
 
     Instances are taken ``shuffle_batches`` batches at a time and the subsets of these are shuffled, which breaks the
     correlation between the subsets of an instance without holding a whole epoch in memory. After the last batch it starts
-    again with the first one and new samples. Unlike other generators it goes on where it stopped, whatever ``rng`` is: the
-    subsets follow from the allocator and the numbers of the batches.
+    again with the first one and new samples. Unlike other generators it continues where it stopped, whatever ``rng`` is: the
+    subsets only depend on the allocator and the numbers of the batches.
 
     :param allocator: The allocator
     :param generator: Draws the instances of the fleet, for :meth:`held_out`
     :param draw_batch: Training instances by number of the batch
     :param batches: The numbers of the epoch's batches
-    :param fraction: Part of the subsets to use, chosen at random
+    :param fraction: Fraction of the subsets to use, chosen at random
     :param stream: Random generator by number of the chunk
     :param shuffle_batches: Batches per chunk
     :ivar seconds: How long it has taken so far to draw and allocate instances
@@ -103,8 +103,8 @@ class AllocatedSubsets(SingleUavGenerator):
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
         Where the generator mixes sizes, subsets of one batch chosen at random, so that small subsets are not padded to large
-        ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets. As every update draws its batch
-        anew, :attr:`fraction` does not apply to them.
+        ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets. As every update draws a new
+        batch, :attr:`fraction` does not apply to them.
         """
         if not isinstance(self.generator, MixtureGenerator):
             return self(batch_size, rng)
@@ -141,7 +141,7 @@ class AllocatedSubsets(SingleUavGenerator):
         Subsets of fresh instances, for the baseline's test.
 
         :param batch_size: Number of subsets
-        :param rng: The source of randomness
+        :param rng: Random generator
         """
         instances = self.allocator.arrange(self.generator(-(-batch_size // self.generator.n_uavs), rng))
         rows = th.arange(len(instances), device="cpu").split(HELD_OUT_ROWS)

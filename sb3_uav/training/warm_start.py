@@ -1,4 +1,4 @@
-"""What the router learns before anything else: imitation, or a function of the user's own."""
+"""Training the router before anything else: by imitation, or by a function of the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _IMITATION_SUFFIX = ".imitation.imitate"
 
 class WarmStart:
     """
-    A function of the policies of router and allocator, the generator of the instances and a random generator.
+    A call of a function with the policies of router and allocator, the generator of the instances and a random generator.
 
     :param given: Arguments of :func:`~sb3_uav.training.imitation.imitate`, or ``{dotted path: arguments}`` of another function
     :raises ValueError: If it is neither
@@ -42,9 +42,9 @@ class WarmStart:
 
     def bind(self, positional: tuple[Any, ...], offered: dict[str, Any]) -> Callable[[], None]:
         """
-        :param positional: The function's first arguments
-        :param offered: Arguments that it gets if it has parameters of these names
-        :return: The call
+        :param positional: Positional arguments of the function
+        :param offered: Arguments passed if the function has parameters of these names
+        :return: A function that makes the call
         :raises ValueError: If there is no such function, or the arguments do not fit
         """
         try:
@@ -64,10 +64,10 @@ class WarmStart:
 
 def bring_progress(folder: Path, earlier: Path | None) -> None:
     """
-    Leave no progress in the folder but that of the checkpoint that this run continues.
+    Replace any progress in the folder by that of the checkpoint from which this run resumes.
 
-    :param folder: Where the warm start is going to look for it
-    :param earlier: Where the checkpoint has it; None if there is no checkpoint
+    :param folder: Folder of the warm start's progress
+    :param earlier: The same folder of the checkpoint; None if there is no checkpoint
     """
     if earlier is not None and earlier.resolve() == folder.resolve():
         return
