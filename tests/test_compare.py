@@ -249,7 +249,7 @@ def test_pretrained_router_is_saved(tmp_path):
     done = pretrain_router(generator, dict(policy_kwargs=NETWORK, n_envs=4), 16, tmp_path / "router.zip")
     assert isinstance(load_policy(tmp_path / "router.zip"), RouterPolicy)
     assert done.startswith("REINFORCE (baseline shared, 8 sample(s) per subset) on 16 subsets")
-    with pytest.raises(ValueError, match="give it as --router"):
+    with pytest.raises(ValueError, match="pass it as --router"):
         pretrain_router(generator, dict(algo="ppo"), 16, tmp_path / "router.zip")
     with pytest.raises(ValueError, match="these arguments do not fit REINFORCE"):
         pretrain_router(generator, dict(n_stepz=3), 16, tmp_path / "router.zip")
