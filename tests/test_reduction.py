@@ -66,6 +66,8 @@ def test_integer_tours_are_feasible(instance: Instances, data: st.DataObject) ->
         check_schedule(instance, 0, schedule)
         assert reduced.routes(schedule) == [list(route)]
     assert coarse <= RESOLUTION or reduced.tour_length(route) > 1
+    rounding = reduced.arc_costs() - reduced.coarse_distances()
+    assert ((rounding == 0) | (rounding == 1)).all()
 
 
 @settings(max_examples=30)

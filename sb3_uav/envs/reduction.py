@@ -94,6 +94,14 @@ class ReducedInstance:
         """
         return np.floor(self.distances * RESOLUTION).astype(np.int64)
 
+    def arc_costs(self) -> np.ndarray:
+        """
+        Rounded up, in the units of :meth:`coarse_distances`: for comparing tours, not for their limit.
+
+        :return: ``(n + 1, n + 1)`` int64
+        """
+        return np.ceil(self.distances * RESOLUTION).astype(np.int64)
+
     def fine_distances(self) -> np.ndarray:
         """
         Rounded up: a tour of at most :data:`FINE_RESOLUTION` is feasible, and so long is every tour that keeps to the maximum

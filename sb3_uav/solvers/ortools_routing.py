@@ -88,7 +88,7 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
         return reduced.schedule([])
     manager = pywrapcp.RoutingIndexManager(reduced.n_tasks + 1, reduced.n_uavs, 0)
     routing = pywrapcp.RoutingModel(manager)
-    routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(reduced.coarse_distances().tolist()))
+    routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(reduced.arc_costs().tolist()))
     flown = routing.RegisterTransitMatrix(reduced.fine_distances().tolist())
     routing.AddDimension(flown, 0, FINE_RESOLUTION, True, "distance")
     for node, penalty in enumerate(reduced.integer_prizes(_LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
