@@ -11,7 +11,7 @@ encoding, the others one, so both rates and both ratios are printed.
     The settings of ``paper-U4`` and ``paper-router`` there: width 128, 3 layers, 8 heads, batch normalization, one sample and
     one greedy rollout of the baseline's policy. As in the paper, the subsets of all UAVs are padded to one size before tours
     are planned; but what they are padded with is masked, while the paper repeats tasks, which makes tours longer, so this
-    favours the paper. Its router is the attention model: the like of ``rl4co-paper``.
+    favors the paper. Its router is the attention model: the like of ``rl4co-paper``.
 ``plain``
     The router as in ``paper``, but with layers, width, heads and normalization of ``default``: the like of ``rl4co-default``.
 ``rl4co-paper``, ``rl4co-default``

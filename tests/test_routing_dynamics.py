@@ -147,7 +147,7 @@ def test_every_accepted_tour_passes_the_checker(instances: Instances, seed: int)
         tour = [node - 1 for node in actions[row, sample].tolist() if node != DEPOT]
         report = check_schedule(instances, row, Schedule([tour]))
         assert report.objective == pytest.approx(rewards[row, sample].sum().item(), rel=1e-12, abs=0)
-        assert report.length == pytest.approx(state.travelled[row, sample].item(), rel=1e-12, abs=0)
+        assert report.length == pytest.approx(state.traveled[row, sample].item(), rel=1e-12, abs=0)
 
 
 @settings(max_examples=100)
@@ -215,8 +215,8 @@ def test_illegal_action_flies_home(instances: Instances, seed: int, lawful_steps
     position = int(state.position)
     way_home = dynamics.home[0, position].item()
     assert new.done.item() and new.position.item() == DEPOT and reward.item() == 0
-    assert new.travelled.item() == state.travelled.item() + way_home
-    assert new.travelled.item() <= instances.max_distance[0].item() * (1 + 1e-9)
+    assert new.traveled.item() == state.traveled.item() + way_home
+    assert new.traveled.item() <= instances.max_distance[0].item() * (1 + 1e-9)
     assert th.equal(new.visited, state.visited)
 
 
@@ -236,10 +236,10 @@ def test_one_tour_by_hand() -> None:
 
     found, state = masks(near, [2, 1, 4, 0])
     assert found == [[0, 1, 1, 0, 1], [0, 1, 0, 0, 1], [0, 0, 0, 0, 1], [1, 0, 0, 0, 0], [1, 0, 0, 0, 0]]
-    assert state.done.item() and state.travelled.item() == 4.0
+    assert state.done.item() and state.traveled.item() == 4.0
     found, state = masks(far, [3, 2, 1, 4])
     assert found == [[0, 1, 1, 1, 1], [0, 1, 1, 0, 1], [0, 1, 0, 0, 1], [0, 0, 0, 0, 1], [1, 0, 0, 0, 0]]
-    assert not state.done.item() and state.travelled.item() == 6.0
+    assert not state.done.item() and state.traveled.item() == 6.0
     problem = RoutingProblem(UniformGenerator(4))
     assert problem.returns(far, th.tensor([[[3, 2, 1, 4, 0], [2, 0, 0, 0, 0]]])).tolist() == [[15.0, 2.0]]
 

@@ -84,8 +84,8 @@ def test_kmeans_gives_every_point_its_own_cluster_if_it_can() -> None:
     assert sorted(kmeans(points, 5, np.random.default_rng(0)).tolist()) == [0, 1, 2, 3, 4]
 
 
-def test_kmeans_centres_are_nearest() -> None:
-    """At the end no point is nearer to another cluster's centre, and more restarts never give a larger inertia."""
+def test_kmeans_centers_are_nearest() -> None:
+    """At the end no point is nearer to another cluster's center, and more restarts never give a larger inertia."""
     points = np.random.default_rng(2).random((80, 2))
 
     def inertia(labels: np.ndarray) -> float:
@@ -93,8 +93,8 @@ def test_kmeans_centres_are_nearest() -> None:
 
     few, many = kmeans(points, 6, np.random.default_rng(0), 1), kmeans(points, 6, np.random.default_rng(0), 30)
     assert inertia(many) <= inertia(few)
-    centres = np.stack([points[many == k].mean(0) for k in range(6)])
-    np.testing.assert_array_equal(np.square(points[:, None] - centres).sum(-1).argmin(1), many)
+    centers = np.stack([points[many == k].mean(0) for k in range(6)])
+    np.testing.assert_array_equal(np.square(points[:, None] - centers).sum(-1).argmin(1), many)
 
 
 @pytest.mark.parametrize("generator", [UniformGenerator(80), ClusteredGenerator(80)])

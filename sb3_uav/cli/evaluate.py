@@ -104,7 +104,7 @@ def _load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
 
 def _make_solvers(args: argparse.Namespace) -> list[Solver]:
     """
-    :param args: Of ``sb3-uav evaluate``
+    :param args: Arguments of ``sb3-uav evaluate``
     :return: The solvers that they ask for, the trained pair first; in place of one that cannot be made, one that refuses all
         instances
     :raises OSError: If a zip of the trained pair is missing, or of the only solver

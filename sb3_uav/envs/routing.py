@@ -26,14 +26,14 @@ class RoutingState(NamedTuple):
     """
     :param position: ``(batch, n_samples)`` int64, the node where the UAV is: 0 the depot, j + 1 task j
     :param visited: ``(batch, n_samples, n_tasks)`` bool
-    :param travelled: ``(batch, n_samples)`` float64, distance flown so far
+    :param traveled: ``(batch, n_samples)`` float64, distance flown so far
     :param done: ``(batch, n_samples)`` bool, True after the return to the depot
     :param action_mask: ``(batch, n_samples, n_tasks + 1)`` bool
     """
 
     position: th.Tensor
     visited: th.Tensor
-    travelled: th.Tensor
+    traveled: th.Tensor
     done: th.Tensor
     action_mask: th.Tensor
 
@@ -42,7 +42,7 @@ class RoutingDynamics(Dynamics):
     """
     Transitions of route planning (paper, section IV-B).
 
-    A task is legal if it is unvisited and the UAV can fly to it and back to the depot: travelled + d(here, task) +
+    A task is legal if it is unvisited and the UAV can fly to it and back to the depot: traveled + d(here, task) +
     d(task, depot) <= D. The depot is legal only when no task is, because an early return never helps. An illegal action
     sends the UAV to the depot and ends the episode.
 
@@ -68,14 +68,14 @@ class RoutingDynamics(Dynamics):
         device = self.instances.device
         position = th.zeros(shape, dtype=th.int64, device=device)
         visited = ~self.instances.task_mask[:, None].expand(-1, n_samples, -1)
-        travelled = th.zeros(shape, dtype=th.float64, device=device)
+        traveled = th.zeros(shape, dtype=th.float64, device=device)
         done = th.zeros(shape, dtype=th.bool, device=device)
-        return RoutingState(position, visited, travelled, done, self._action_mask(position, visited, travelled, done))
+        return RoutingState(position, visited, traveled, done, self._action_mask(position, visited, traveled, done))
 
-    def _action_mask(self, position: th.Tensor, visited: th.Tensor, travelled: th.Tensor, done: th.Tensor) -> th.Tensor:
+    def _action_mask(self, position: th.Tensor, visited: th.Tensor, traveled: th.Tensor, done: th.Tensor) -> th.Tensor:
         here = self.points(position)
         detour = euclidean(self.nodes[:, None, 1:], here[:, :, None]) + self.home[:, None, 1:]
-        feasible = ~visited & (travelled[..., None] + detour <= self.limit[:, None, None]) & ~done[..., None]
+        feasible = ~visited & (traveled[..., None] + detour <= self.limit[:, None, None]) & ~done[..., None]
         return th.cat([~feasible.any(-1, keepdim=True), feasible], dim=-1)
 
     def step(self, state: RoutingState, actions: th.Tensor) -> tuple[RoutingState, th.Tensor]:
@@ -84,14 +84,14 @@ class RoutingDynamics(Dynamics):
         goes_home = (node == DEPOT) & ~state.done
         here, there = self.points(state.position), self.points(node)
         # A finished UAV stays at the depot: its leg has length 0.
-        travelled = state.travelled + euclidean(there, here)
+        traveled = state.traveled + euclidean(there, here)
         # The extra first column absorbs visits to the depot.
         visited = th.cat([th.zeros_like(state.visited[..., :1]), state.visited], dim=-1)
         visited = visited.scatter(-1, node[..., None], True)[..., 1:]
         done = state.done | goes_home
         prizes = th.cat([th.zeros_like(self.instances.values[:, :1]), self.instances.values], dim=1)
         rewards = prizes.gather(1, node)
-        return RoutingState(node, visited, travelled, done, self._action_mask(node, visited, travelled, done)), rewards
+        return RoutingState(node, visited, traveled, done, self._action_mask(node, visited, traveled, done)), rewards
 
 
 def nearest_feasible(instances: Instances) -> th.Tensor:
@@ -147,7 +147,7 @@ class RoutingProblem(Problem):
         return RoutingDynamics(instances)
 
     def observe(self, dynamics: RoutingDynamics, state: RoutingState) -> dict[str, th.Tensor]:
-        remaining = dynamics.instances.max_distance[:, None] - state.travelled
+        remaining = dynamics.instances.max_distance[:, None] - state.traveled
         return {
             "position": state.position,
             "remaining_distance": remaining,

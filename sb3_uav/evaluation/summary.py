@@ -31,7 +31,7 @@ class SummaryRow:
     :param n_instances: Number of instances
     :param n_feasible: On how many of them the solver found a feasible schedule
     :param objective: Mean objective of the feasible schedules
-    :param standard_error: Of that mean
+    :param standard_error: Standard error of that mean
     :param gap: See :func:`gaps`, in percent; NaN if the solver has no feasible schedule for some of the instances
     :param reference: Name of the solver that this one is compared with
     :param n_paired: On how many instances both found a feasible schedule

@@ -46,7 +46,7 @@ def print_table(summary: Sequence[SummaryRow]) -> None:
 def _table(rich: Any, rows: Sequence[SummaryRow]) -> Any:
     """
     :param rich: The module
-    :param rows: Of one set of instances and one time limit
+    :param rows: Rows of one set of instances and one time limit
     :return: Their table
     """
     first = rows[0]

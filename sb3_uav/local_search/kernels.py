@@ -841,7 +841,7 @@ def descend(plan, n_near_joined, n_near_inserted, max_string):
     """
     One round of every neighborhood.
 
-    :param n_near_joined: To how many neighbors a task may be joined
+    :param n_near_joined: Number of neighbors that a task may be joined to
     :param n_near_inserted: Beside how many neighbors a task may be inserted where a string has been taken out
     :param max_string: The longest string of tasks that is taken out; 0 for none
     :return: Whether anything has changed

@@ -40,7 +40,7 @@ def save_figure(figure: Any, path: Path, metadata: Mapping[str, str | None] | No
     Write a figure under a temporary name and rename it.
 
     :param figure: The figure
-    :param path: From :func:`checked_path`; its folder is created if missing
+    :param path: Path that :func:`checked_path` returned; its folder is created if missing
     :param metadata: Written into the file, under keys that its format has; None leaves out what is written by default
     """
     with temporary_name(path) as temporary:

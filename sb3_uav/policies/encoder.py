@@ -43,14 +43,14 @@ class _InstanceNorm(nn.Module):
         """
         if node_mask is None:
             # th.var_mean is four times as slow on CPUs.
-            centred = nodes - nodes.mean(1, keepdim=True)
-            variance = (centred**2).mean(1, keepdim=True)
+            centered = nodes - nodes.mean(1, keepdim=True)
+            variance = (centered**2).mean(1, keepdim=True)
         else:
             real = node_mask[..., None]
             count = real.sum(1, keepdim=True)
-            centred = nodes - nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-            variance = (centred**2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-        return centred * ((variance + _NORM_EPSILON).rsqrt() * self.weight) + self.bias
+            centered = nodes - nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
+            variance = (centered**2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
+        return centered * ((variance + _NORM_EPSILON).rsqrt() * self.weight) + self.bias
 
 
 class _NodeNorm(nn.Module):

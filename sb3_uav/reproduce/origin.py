@@ -63,7 +63,7 @@ class Origin:
 
     def metadata(self, suffix: str) -> dict[str, str | None]:
         """
-        :param suffix: Of a picture
+        :param suffix: Suffix of a picture's file name
         :return: The same under the keys that its format has, without the time, so that equal data give equal files
         """
         title, text = self["Command"], " | ".join(self.lines)

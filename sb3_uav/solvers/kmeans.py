@@ -43,7 +43,7 @@ def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restar
 
 def _spread_centers(points: np.ndarray, n_clusters: int, rng: np.random.Generator) -> np.ndarray:
     """
-    k-means++: each next centre is a point drawn with probability proportional to its squared distance to the centers so far.
+    k-means++: each next center is a point drawn with probability proportional to its squared distance to the centers so far.
 
     :return: ``(n_clusters, 2)``
     """

@@ -57,8 +57,8 @@ class Rows:
         """
         Start rows.
 
-        :param lower: Of every new row, broadcast against ``upper``
-        :param upper: Of every new row
+        :param lower: Lower bound of every new row, broadcast against ``upper``
+        :param upper: Upper bound of every new row
         :return: Their indices, of the broadcast shape
         """
         lower, upper = np.broadcast_arrays(np.asarray(lower, dtype=float), np.asarray(upper, dtype=float))
@@ -70,7 +70,7 @@ class Rows:
         """
         Add entries; the arguments are broadcast against each other.
 
-        :param rows: From :meth:`new`
+        :param rows: Rows that :meth:`new` returned
         :param columns: Columns
         :param coefficients: Coefficients
         """

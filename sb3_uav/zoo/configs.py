@@ -71,7 +71,7 @@ def default_config(algo: str, env_id: str | None = None) -> Path | None:
 
 def plain_numbers(value: Any) -> Any:
     """
-    :param value: From a YAML file
+    :param value: A value of a YAML file
     :return: The value with numbers in place of strings such as ``1e-3``, which YAML 1.1 reads as strings
     """
     if isinstance(value, dict):
