@@ -15,7 +15,7 @@ from sb3_uav.envs import Instances, Schedule, UniformGenerator
 from sb3_uav.evaluation.results import FAILED, OK, ResultRow, read_results
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.plots import anytime, plot_anytime
-from sb3_uav.plots.anytime import anytime_panels
+from sb3_uav.plots.anytime import _anytime_panels
 from sb3_uav.solvers import Solver, SolverResult
 
 
@@ -66,7 +66,7 @@ def row(
 
 def test_panels_of_an_evaluation(folder: Path) -> None:
     """A panel for every set; what did not solve all instances is left out, and said to be."""
-    panels = anytime_panels(read_results(folder / "results.csv"))
+    panels = _anytime_panels(read_results(folder / "results.csv"))
     assert [(panel.source, panel.n_instances, panel.left_out) for panel in panels] == [
         ("U4-N20", 3, ["timed (0.5 s)"]),
         ("U4-N30", 3, ["timed (0.5 s)"]),
@@ -86,7 +86,7 @@ def test_bands_by_hand() -> None:
     rows = [row("slow", 8.0, i, objective, 7.0) for i, objective in enumerate([10.0, 22.0, 32.0])]
     rows += [row("slow", 2.0, i, objective, 2.0 + i) for i, objective in enumerate([9.0, 20.0, 29.0])]
     rows += [row("quick", None, i, objective) for i, objective in enumerate([9.0, 19.0, 30.0])]
-    (panel,) = anytime_panels(rows)
+    (panel,) = _anytime_panels(rows)
     slow, quick = panel.curves
     np.testing.assert_allclose(slow.seconds, [3.0, 7.0])
     np.testing.assert_allclose(slow.objective, [58 / 3, 64 / 3])
@@ -96,7 +96,7 @@ def test_bands_by_hand() -> None:
 
 def test_seeds_are_averaged() -> None:
     rows = [row("a", 1.0, i, 10.0 * i + seed, 1.0 + seed, seed) for seed in (0, 4) for i in range(2)]
-    (panel,) = anytime_panels(rows)
+    (panel,) = _anytime_panels(rows)
     assert panel.curves[0].objective.tolist() == [7.0] and panel.curves[0].seconds.tolist() == [3.0]
 
 
@@ -105,7 +105,7 @@ def test_limits_that_make_no_difference() -> None:
     rows = [row("same", limit, i, 5.0 + i, limit) for limit in (3.0, 1.0) for i in range(2)]
     rows += [row("torn", 1.0, 0, 5.0), row("torn", 1.0, 1, None), row("torn", 3.0, 0, 5.0), row("torn", 3.0, 1, 6.0)]
     rows += [row("never", None, 0, None), row("fast", None, 0, 5.0), row("fast", None, 1, 6.0)]
-    (panel,) = anytime_panels(rows)
+    (panel,) = _anytime_panels(rows)
     assert [(curve.solver, len(curve.seconds)) for curve in panel.curves] == [("same", 2), ("torn", 1), ("fast", 1)]
     assert panel.curves[0].seconds.tolist() == [1.0, 3.0]
     assert panel.left_out == ["torn (1 s)", "never"]
@@ -154,7 +154,7 @@ def test_some_of_the_solvers(folder: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_every_look_is_another() -> None:
-    looks = [tuple(anytime.solver_style(number).values()) for number in range(64)]
+    looks = [tuple(anytime._solver_style(number).values()) for number in range(64)]
     assert len(set(looks)) == 64
 
 

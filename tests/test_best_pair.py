@@ -18,12 +18,12 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, StopT
 from sb3_uav.common.files import write_atomically
 from sb3_uav.training import FixedSetEvalCallback, SizeGridCallback, best_pair
 from sb3_uav.training.best_pair import BestPair, find_best_router
-from sb3_uav.training.size_grid import BEST_ALLOCATOR_FILE
+from sb3_uav.training.size_grid import _BEST_ALLOCATOR_FILE
 
 pytest.importorskip("rl_zoo3")
 from rl_zoo3.callbacks import TrialEvalCallback
 
-from sb3_uav.zoo.enjoy import find_router
+from sb3_uav.zoo.enjoy import _find_router
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:SizeGridCallback is deprecated"),
@@ -75,7 +75,7 @@ def evaluating(names: tuple[str, ...], folder: Path) -> list[BaseCallback]:
 
 def instances_of_pair(folder: Path) -> tuple[int, int]:
     """How many instances allocator and router of the best pair have learned from, as ``enjoy --load-best`` finds them."""
-    router = find_router(folder, best=True)
+    router = _find_router(folder, best=True)
     assert router is not None
     zips = [zipfile.ZipFile(path) for path in (folder / "best_model.zip", router)]
     data = [json.loads(file.read("data")) for file in zips]
@@ -131,9 +131,9 @@ def test_best_pair_was_evaluated_together(names, callbacks_first, tmp_path, monk
     evaluators = {"fixed": {"FixedSetEvalCallback"}, "grid": {"SizeGridCallback"}}
     # One callback decides on the best pair, all the time.
     assert watch.evaluators == evaluators.get(owner, watch.evaluators)
-    assert (tmp_path / BEST_ALLOCATOR_FILE).is_file() == (owner == "grid")
+    assert (tmp_path / _BEST_ALLOCATOR_FILE).is_file() == (owner == "grid")
     if owner == "grid":
-        assert (tmp_path / BEST_ALLOCATOR_FILE).read_bytes() == (tmp_path / "best_model.zip").read_bytes()
+        assert (tmp_path / _BEST_ALLOCATOR_FILE).read_bytes() == (tmp_path / "best_model.zip").read_bytes()
 
 
 def test_two_folders_have_two_pairs(tmp_path):
@@ -177,7 +177,7 @@ def test_without_its_sb3_saves_its_own_best_model(tmp_path):
     stock = evaluation(tmp_path)
     make_allocator().learn(2 * 8 * N_TASKS, callback=stock)
     assert stock.best_model_save_path == str(tmp_path) and not (tmp_path / "best_pair.json").exists()
-    assert find_router(tmp_path, best=True) is None
+    assert _find_router(tmp_path, best=True) is None
 
 
 # ------------------------------------------------------------------------------------------ interruptions

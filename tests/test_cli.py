@@ -34,10 +34,10 @@ def test_no_command(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None
     assert stop.value.code == 2 and "sb3-uav: error: " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", sorted(cli.FORWARDED))
+@pytest.mark.parametrize("command", sorted(cli._FORWARDED))
 def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Everything after the command reaches its own parser, options included; its exit code comes back."""
-    module = types.ModuleType(cli.FORWARDED[command][0])
+    module = types.ModuleType(cli._FORWARDED[command][0])
     received: list[Any] = []
 
     def main(argv: list[str]) -> int | None:

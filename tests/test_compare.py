@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, TaskAllocationEnv, UniformGenerator
-from sb3_uav.plots.bands import Band, BandPanel, plot_bands, visible_range
+from sb3_uav.plots.bands import Band, BandPanel, _visible_range, plot_bands
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.training import fixed_set
@@ -26,14 +26,14 @@ from sb3_uav.training.fixed_set_history import EvaluationHistory, FixedSetResult
 
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli
-from sb3_uav.cli.compare import make_parser
+from sb3_uav.cli.compare import _make_parser
 from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.studies.compare.common_ground import make_validation_set
-from sb3_uav.studies.compare.fixed_router import DividedSubsets, pretrain_router
-from sb3_uav.studies.compare.report import Run, compute_band, compute_table, csv_text, estimate, interpolate
+from sb3_uav.studies.compare.fixed_router import _DividedSubsets, pretrain_router
+from sb3_uav.studies.compare.report import Run, _compute_band, _compute_table, _csv_text, _estimate, _interpolate
 from sb3_uav.studies.compare.runs import ZooTraining, train_all
 from sb3_uav.studies.compare.settings import Settings
-from sb3_uav.studies.compare.study import with_common_ground
+from sb3_uav.studies.compare.study import _with_common_ground
 from sb3_uav.studies.compare.variants import callback_name, callbacks_of, read_variants, router_settings
 
 ALLOCATION, ROUTING = "TaskAllocation-U3-N20-v0", "RoutePlanning-N20-v0"
@@ -64,7 +64,7 @@ def runs() -> list[Run]:
 
 def test_table_at_equal_steps(runs):
     """By hand: seeds of A have means 6 and 8 at 100 steps (110 steps interpolated), seeds of B 8 and 11."""
-    best, other = compute_table(runs, "timesteps", 100)
+    best, other = _compute_table(runs, "timesteps", 100)
     assert (best.variant, other.variant) == ("B", "A") and (best.n_seeds, best.timesteps) == (2, 100)
     assert best.greedy.mean == 9.5 and other.greedy.mean == pytest.approx(7.0)
     # t(0.975, 1) = 12.706; the standard error of (8, 11) is 1.5, that of (6, 8) is 1.
@@ -78,16 +78,16 @@ def test_table_at_equal_steps(runs):
 
 def test_table_at_equal_time(runs):
     """After 10 s the slower variant stands half-way."""
-    best, other = compute_table(runs, "train_seconds", 10)
+    best, other = _compute_table(runs, "train_seconds", 10)
     assert (best.variant, other.variant) == ("A", "B")
     assert best.greedy.mean == pytest.approx((6 + 8.8) / 2) and other.greedy.mean == pytest.approx(9.5 / 2)
     assert (best.timesteps, other.timesteps) == (105, 50)
 
 
 def test_one_seed_has_no_interval(runs):
-    row = compute_table(runs[:1], "timesteps", 100)[0]
+    row = _compute_table(runs[:1], "timesteps", 100)[0]
     assert np.isnan(row.greedy.half_width) and str(row.greedy) == "6.00"
-    assert str(estimate(np.array([1.0, 3.0, 2.0]))) == "2.00 ± 2.48"
+    assert str(_estimate(np.array([1.0, 3.0, 2.0]))) == "2.00 ± 2.48"
 
 
 def test_student_intervals_agree_with_tables():
@@ -100,19 +100,19 @@ def test_student_intervals_agree_with_tables():
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=8), st.floats(-1.0, 9.0))
 def test_interpolation_is_numpys(values, at):
     x = np.arange(len(values))
-    found = interpolate(x, np.array(values)[:, None], np.array([at]))[0, 0]
+    found = _interpolate(x, np.array(values)[:, None], np.array([at]))[0, 0]
     assert found == pytest.approx(np.interp(at, x, values), abs=1e-9)
 
 
 def test_bands(runs):
-    band = compute_band(runs[:2], "timesteps", "results", 200)
+    band = _compute_band(runs[:2], "timesteps", "results", 200)
     assert band.x[[0, -1]].tolist() == [0, 100] and band.mean[-1] == pytest.approx(7.0)
     assert band.half_width[-1] == pytest.approx(12.706)
-    assert compute_band(runs[:2], "timesteps", "sampled", 50).mean[0] == 1.0
+    assert _compute_band(runs[:2], "timesteps", "sampled", 50).mean[0] == 1.0
 
 
 def test_csv_has_a_row_per_evaluation(runs):
-    rows = list(csv.DictReader(csv_text(runs).splitlines()))
+    rows = list(csv.DictReader(_csv_text(runs).splitlines()))
     assert len(rows) == 8
     expected = {"algorithm": "reinforce", "variant": "B", "seed": "1", "timesteps": "100", "wall_seconds": "20.000"}
     assert {key: rows[-1][key] for key in expected} == expected
@@ -122,10 +122,10 @@ def test_csv_has_a_row_per_evaluation(runs):
 def test_wide_bands_do_not_flatten_the_curves(tmp_path):
     x = np.arange(3.0)
     narrow, wide = Band(x, x, x * 0 + 0.5), Band(x, x, x * 0 + 100)
-    assert visible_range([narrow]) == pytest.approx((-0.6, 2.6))
-    assert visible_range([narrow, wide]) == pytest.approx((-2.1, 4.1))
+    assert _visible_range([narrow]) == pytest.approx((-0.6, 2.6))
+    assert _visible_range([narrow, wide]) == pytest.approx((-2.1, 4.1))
     single = Band(x, x, x * np.nan)
-    assert visible_range([single]) == pytest.approx((-0.1, 2.1))
+    assert _visible_range([single]) == pytest.approx((-0.1, 2.1))
     plot_bands([[BandPanel("x", "y", {"a": narrow, "b": wide}), BandPanel("x", "y", {"a": single})]], tmp_path / "bands.pdf")
     assert (tmp_path / "bands.pdf").read_bytes().startswith(b"%PDF")
     with pytest.raises(ValueError, match="at least one curve"):
@@ -136,7 +136,7 @@ def test_wide_bands_do_not_flatten_the_curves(tmp_path):
 
 
 def make_settings(folder: Path, *flags: str) -> Settings:
-    args = vars(make_parser().parse_args(["--env", ALLOCATION, "--out", str(folder), "--eval-freq", "100", *flags]))
+    args = vars(_make_parser().parse_args(["--env", ALLOCATION, "--out", str(folder), "--eval-freq", "100", *flags]))
     del args["report_only"]
     return Settings(**args)
 
@@ -193,7 +193,7 @@ def test_all_variants_get_the_same_ground(tmp_path):
     """ITS and evaluations of the YAMLs make room for the common router and set; other callbacks stay."""
     settings = make_settings(tmp_path, "-n", "1234", "--samples", "5")
     for variant in read_variants(None, ALLOCATION):
-        entry = with_common_ground(variant, settings, True).entry
+        entry = _with_common_ground(variant, settings, True).entry
         names = [callback_name(callback) for callback in callbacks_of(entry)]
         assert entry["n_timesteps"] == 1234 and names[-2:] == ["PretrainedRouterCallback", "FixedSetEvalCallback"]
         assert "ITSCallback" not in names and len(set(names)) == len(names)
@@ -202,7 +202,7 @@ def test_all_variants_get_the_same_ground(tmp_path):
         (evaluation,) = callbacks_of(entry)[-1].values()
         assert evaluation["instances"] == str(tmp_path / "validation.npz")
         fixed_set.FixedSetEvalCallback(**{**evaluation, "instances": None})
-        with_its = with_common_ground(variant, make_settings(tmp_path, "--its"), False).entry
+        with_its = _with_common_ground(variant, make_settings(tmp_path, "--its"), False).entry
         assert [callback_name(callback) for callback in callbacks_of(with_its)].count("ITSCallback") == 1
 
 
@@ -213,9 +213,9 @@ def test_all_variants_get_the_same_ground(tmp_path):
 def test_subsets_are_parts_of_instances(n_uavs, n_tasks, batch_size, seed):
     """Every task of a subset is one of its instance, once; the same random numbers give the same subsets."""
     generator = UniformGenerator(n_tasks, n_uavs, 1.5)
-    subsets = DividedSubsets(generator)(batch_size, np.random.default_rng(seed))
+    subsets = _DividedSubsets(generator)(batch_size, np.random.default_rng(seed))
     assert len(subsets) == batch_size and subsets.n_uavs == 1 and (subsets.max_distance == 1.5).all()
-    again = DividedSubsets(generator)(batch_size, np.random.default_rng(seed))
+    again = _DividedSubsets(generator)(batch_size, np.random.default_rng(seed))
     assert th.equal(subsets.tasks, again.tasks)
     originals = generator(-(-batch_size // n_uavs), np.random.default_rng(seed))
     for row in range(batch_size):
@@ -235,7 +235,7 @@ def test_half_of_the_instances_are_cut_into_sectors():
         def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
             return instances
 
-    subsets = DividedSubsets(Given(80, 4))(800, np.random.default_rng(0))
+    subsets = _DividedSubsets(Given(80, 4))(800, np.random.default_rng(0))
     directions = subsets.tasks / subsets.tasks.norm(dim=-1, keepdim=True).clamp(min=1e-9) * subsets.task_mask[..., None]
     concentration = directions.sum(1).norm(dim=-1) / subsets.task_mask.sum(1)
     # 0.9 is the mean length of unit vectors over a right angle.
@@ -249,7 +249,7 @@ def test_pretrained_router_is_saved(tmp_path):
     done = pretrain_router(generator, dict(policy_kwargs=NETWORK, n_envs=4), 16, tmp_path / "router.zip")
     assert isinstance(load_policy(tmp_path / "router.zip"), RouterPolicy)
     assert done.startswith("REINFORCE (baseline shared, 8 sample(s) per subset) on 16 subsets")
-    with pytest.raises(ValueError, match="give it as --router"):
+    with pytest.raises(ValueError, match="pass it as --router"):
         pretrain_router(generator, dict(algo="ppo"), 16, tmp_path / "router.zip")
     with pytest.raises(ValueError, match="these arguments do not fit REINFORCE"):
         pretrain_router(generator, dict(n_stepz=3), 16, tmp_path / "router.zip")

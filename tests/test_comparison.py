@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, ResultRow
-from sb3_uav.evaluation.summary import SUMMARY_COLUMNS, gaps, optimality_gap, summarize, write_summary
+from sb3_uav.evaluation.summary import _SUMMARY_COLUMNS, _optimality_gap, gaps, summarize, write_summary
 from sb3_uav.evaluation.table import print_table
 
 
@@ -118,7 +118,7 @@ def test_bounds_by_hand() -> None:
     assert exact.optimality_gap == pytest.approx(100 * (0 + 1 / 9 + 0) / 3)
     assert loose.optimality_gap == pytest.approx(100 * (1 / 4 + 1 / 9 + 6 / 12 + 0) / 4)
     assert heuristic.optimality_gap == pytest.approx(100 * (2 / 4 + 0 + 3 / 12 + 0) / 4)
-    assert math.isnan(optimality_gap(np.array([1.0, np.nan]), np.array([np.nan, 2.0])))
+    assert math.isnan(_optimality_gap(np.array([1.0, np.nan]), np.array([np.nan, 2.0])))
 
 
 def test_a_bound_below_what_is_achieved_is_wrong() -> None:
@@ -189,9 +189,9 @@ def test_summary_files(tmp_path: Path) -> None:
     assert "NaN" not in text and (told["reference"], told["seed"], told["confidence"]) == ("a", 3, 0.95)
     with (tmp_path / "summary.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == SUMMARY_COLUMNS
+    assert tuple(rows[0]) == _SUMMARY_COLUMNS
     for row, record, expected in zip(rows, told["rows"], summary, strict=True):
-        for name in SUMMARY_COLUMNS:
+        for name in _SUMMARY_COLUMNS:
             value: Any = getattr(expected, name)
             missing = value is None or (isinstance(value, float) and math.isnan(value))
             assert record[name] == (None if missing else value)

@@ -55,7 +55,7 @@ def test_memory_bounds_the_batch(instances: Instances, monkeypatch: pytest.Monke
     """With hardly any memory, instances are solved one by one, and nothing else changes."""
     pair = make_pair(decode="sampling", samples=3)
     roomy = pair.solve(instances, seed=0)
-    monkeypatch.setattr(memory, "CPU_MEMORY", 1)
+    monkeypatch.setattr(memory, "_CPU_MEMORY", 1)
     tight = pair.solve(instances, seed=0)
     assert [result.batch_size for result in tight] == [1] * 9
     assert [result.schedule for result in tight] == [result.schedule for result in roomy]
@@ -106,7 +106,7 @@ def test_samples_begin_at_several_gaps(sweep: bool, instances: Instances, monkey
         orders = [pair.allocator.task_order(instances[i], variant) for variant in range(len(tasks))]
         assert th.equal(tasks, th.cat([instances[i].reorder(order).tasks for order in orders]))
         different = {tuple(order.flatten().tolist()) for order in orders}
-        assert len(different) == decoding.N_SWEEPS == 8 if sweep else len(orders) == 1
+        assert len(different) == decoding._N_SWEEPS == 8 if sweep else len(orders) == 1
 
 
 def test_sampling_follows_the_seed(instances: Instances) -> None:
@@ -193,10 +193,10 @@ def test_augmentation_plans_no_more_tours_than_asked_for(
 
 def test_views_of_augmentation() -> None:
     """First all symmetries in both directions from the widest gap, then the same from the next gap."""
-    views = [decoding.view_of(number) for number in range(3 * decoding.N_VIEWS)]
+    views = [decoding._view_of(number) for number in range(3 * decoding._N_VIEWS)]
     assert len(set(views)) == len(views)
     for turn in range(3):
-        of_turn = views[turn * decoding.N_VIEWS : (turn + 1) * decoding.N_VIEWS]
+        of_turn = views[turn * decoding._N_VIEWS : (turn + 1) * decoding._N_VIEWS]
         assert {view.symmetry for view in of_turn} == set(range(8)) and {view.sweep // 2 for view in of_turn} == {turn}
 
 
@@ -204,16 +204,16 @@ def test_more_tours_are_tried_for_the_best_allocations_of_augmentation(
     instances: Instances, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the last block, and they are not worse than the greedy tours of the same allocations, if seen in the same view."""
-    monkeypatch.setattr(decoding, "N_VIEWS", 1)
+    monkeypatch.setattr(decoding, "_N_VIEWS", 1)
     pair = make_pair(decode="augment", samples=MANY)
-    n_tours = MANY // 4 // decoding.N_REVISITED
+    n_tours = MANY // 4 // decoding._N_REVISITED
     *first, last = decoding.Decoder(pair.allocator, pair.router, "augment", MANY).blocks(
         instances, range(len(instances)), 0, hurry=False
     )
-    assert last.value.shape == (len(instances), decoding.N_REVISITED)
+    assert last.value.shape == (len(instances), decoding._N_REVISITED)
     values = th.cat([block.value for block in first], dim=1)
-    assert values.shape[1] == MANY - decoding.N_REVISITED * n_tours
-    best = values.sort(dim=1, descending=True).values[:, : decoding.N_REVISITED]
+    assert values.shape[1] == MANY - decoding._N_REVISITED * n_tours
+    best = values.sort(dim=1, descending=True).values[:, : decoding._N_REVISITED]
     assert (last.value >= best - 1e-9).all() and last.value.sum() > best.sum()
 
 

@@ -23,7 +23,7 @@ from sb3_uav.policies import AllocatorPolicy, RouterExtractor, RouterPolicy
 from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import EpisodeBufferCallback, EpisodeRolloutBuffer, MaskableEpisodeRolloutBuffer
-from sb3_uav.training.episode_buffer import split_evenly, use_episode_buffer
+from sb3_uav.training.episode_buffer import _split_evenly, use_episode_buffer
 
 N_TASKS, N_ENVS, N_STEPS = 7, 4, 10
 LEVELS = ("allocator", "router")
@@ -254,7 +254,7 @@ def test_an_instance_with_most_of_the_steps_does_not_fill_the_table_with_copies(
     results = []
     for limit in (grouping.source.numel() / len(indices) / 2, grouping.source.numel()):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("sb3_uav.policies.extractor.MAX_FILLING", limit)
+            patch.setattr("sb3_uav.policies.extractor._MAX_FILLING", limit)
             model.policy.features_extractor.n_encoded_rows = 0
             results.append(model.policy.evaluate_actions(observations, th.zeros(len(indices))))
             assert model.policy.features_extractor.n_encoded_rows == len(lengths)
@@ -268,7 +268,7 @@ def test_an_instance_with_most_of_the_steps_does_not_fill_the_table_with_copies(
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=40), st.integers(1, 200))
 def test_fragments_are_split_evenly(lengths, batch_size):
     lengths_array = np.array(lengths)
-    runs = split_evenly(lengths_array, batch_size)
+    runs = _split_evenly(lengths_array, batch_size)
     assert np.concatenate(runs).tolist() == list(range(len(lengths)))
     sizes = [int(lengths_array[run].sum()) for run in runs]
     assert min(sizes) > 1 or len(sizes) == 1

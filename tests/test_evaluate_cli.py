@@ -16,7 +16,7 @@ from evaluation_helpers import read_schedules
 
 from sb3_uav.common.files import file_hash
 from sb3_uav.envs import Instances, check_schedule
-from sb3_uav.envs.schedule import schedule_from_json
+from sb3_uav.envs.schedule import _schedule_from_json
 from sb3_uav.solvers import SOLVERS
 from sb3_uav.solvers.decoding import DECODINGS
 
@@ -43,7 +43,7 @@ def test_files_and_table(decode: str, title: str, inputs: Inputs, tmp_path: Path
     files = [Instances.load(inputs.small), Instances.load(inputs.large)]
     for row, line in zip(rows, lines, strict=True):
         assert sorted(line) == ["instance", "lengths", "objective", "routes", "seed", "solver", "time_limit"]
-        _, index, schedule = schedule_from_json(line, "schedules.jsonl")
+        _, index, schedule = _schedule_from_json(line, "schedules.jsonl")
         instances, index = (files[0], index) if index < 4 else (files[1], index - 4)
         report = check_schedule(instances, index, schedule)
         assert len(schedule.routes) == 3

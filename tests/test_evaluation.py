@@ -15,7 +15,7 @@ from evaluation_helpers import Choosy, Limited, Nearest, Stub, Unlimited, conten
 
 from sb3_uav.common.files import file_hash
 from sb3_uav.envs import Instances, UniformGenerator, check_schedule
-from sb3_uav.envs.schedule import schedule_from_json
+from sb3_uav.envs.schedule import _schedule_from_json
 from sb3_uav.evaluation.results import RESULT_COLUMNS
 from sb3_uav.evaluation.run import evaluate, find_reference
 from sb3_uav.solvers import SolverResult, make_solver
@@ -76,7 +76,7 @@ def test_every_column(instances: Instances, tmp_path: Path) -> None:
         for i in of
     ]
     for row, line in zip(rows, read_schedules(tmp_path), strict=True):
-        _, index, schedule = schedule_from_json(line, "schedules.jsonl")
+        _, index, schedule = _schedule_from_json(line, "schedules.jsonl")
         report = check_schedule(instances, index % 5, schedule)
         assert float(row["objective"]) == report.objective and float(row["length"]) == report.length
         batch_size = "1" if row["solver"] == "nearest" else {"a": "5", "b, c": "2"}[row["source"]]

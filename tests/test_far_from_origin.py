@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator, check_schedule
-from sb3_uav.envs.instances import FAR_FROM_ORIGIN
+from sb3_uav.envs.instances import _FAR_FROM_ORIGIN
 from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.solvers import make_solver
 
@@ -62,7 +62,7 @@ def test_instances_near_the_origin_are_seen_as_they_are() -> None:
     observation = make("allocation", n_tasks=9, n_uavs=2).problem.observe_static(instances)
     assert th.equal(observation["depot"], instances.depot.float())
     assert th.equal(observation["tasks"], instances.tasks.float().flatten(1))
-    limit = 2 * FAR_FROM_ORIGIN
+    limit = 2 * _FAR_FROM_ORIGIN
     border = Instances.from_arrays([[limit, -limit], [-limit - 1e-9, 0.0]], [[[limit, 3.0]], [[1.0, 3.0]]], max_distance=2.0)
     assert border.near_origin().depot.tolist() == [[limit, -limit], [0.0, 0.0]]
     assert border.near_origin().tasks.tolist() == [[[limit, 3.0]], [[1.0 + limit + 1e-9, 3.0]]]

@@ -74,7 +74,7 @@ def test_chunks_change_nothing(monkeypatch):
     policy, problem = make_model().policy, allocation_env().problem
     instances = draw_fixed_set(problem, 7, 0)
     whole = evaluate_fixed_set(policy, problem, instances, 0)
-    monkeypatch.setattr(fixed_set_returns, "CHUNK_ROWS", 2)
+    monkeypatch.setattr(fixed_set_returns, "_CHUNK_ROWS", 2)
     assert np.array_equal(evaluate_fixed_set(policy, problem, instances, 0).greedy, whole.greedy)
     assert evaluate_fixed_set(policy, problem, instances, 3).sampled.shape == (7,)
 
@@ -153,7 +153,7 @@ def test_once_per_epoch_of_reinforce(tmp_path):
 
 
 def test_seldom_without_epochs(tmp_path, monkeypatch):
-    monkeypatch.setattr(fixed_set, "DEFAULT_EVAL_FREQ", 50)
+    monkeypatch.setattr(fixed_set, "_DEFAULT_EVAL_FREQ", 50)
     make_model(PPO).learn(6 * ROLLOUT, callback=make_callback(tmp_path, eval_freq=None))
     assert load(tmp_path).timesteps.tolist() == [0, 60, 100, 120]
 

@@ -12,7 +12,7 @@ from instance_helpers import assert_equal
 
 from sb3_uav.envs import ClusteredGenerator, FixedGenerator, InstanceGenerator, Instances, UniformGenerator
 from sb3_uav.envs.generators import make_generator
-from sb3_uav.envs.instances import TENSOR_FIELDS
+from sb3_uav.envs.instances import _TENSOR_FIELDS
 
 DRAWERS = [
     UniformGenerator(n_tasks=7, n_uavs=3, max_distance=1.5),
@@ -27,7 +27,7 @@ class TestGenerators:
         drawn = generator(200, np.random.default_rng(0))
         assert (len(drawn), drawn.n_tasks, drawn.n_uavs) == (200, 7, 3) == (200, generator.n_tasks, generator.n_uavs)
         drawn.validate()
-        assert {getattr(drawn, name).dtype for name in TENSOR_FIELDS[:4]} == {th.float64}
+        assert {getattr(drawn, name).dtype for name in _TENSOR_FIELDS[:4]} == {th.float64}
         for points in (drawn.depot, drawn.tasks):
             assert points.min() >= 0 and points.max() <= 1
         assert (drawn.values == 1).all() and (drawn.max_distance == 1.5).all() and drawn.task_mask.all()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances, UniformGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
-from sb3_uav.policies.fleet_geometry import FULL, N_NEIGHBORS, FleetFeature, FleetGeometry
+from sb3_uav.policies.fleet_geometry import _FULL, _N_NEIGHBORS, FleetFeature, FleetGeometry
 from sb3_uav.policies.geometry import FARTHEST, NEAR, NodeFeature, node_features, scaled_coordinates
 from sb3_uav.policies.move_geometry import N_NEXT, MoveFeature, MoveGeometry
 from sb3_uav.policies.static_observation import StaticObservation
@@ -38,12 +38,15 @@ def test_features_are_finite_for_instances_of_any_magnitude(instances: Instances
     assert features.isfinite().all()
 
 
-def test_scaled_instances_have_the_same_features() -> None:
-    """Moved, and in another unit: the features are the same."""
+@pytest.mark.parametrize("offset", [7.0, 1e7])
+def test_scaled_instances_have_the_same_features(offset: float) -> None:
+    """Moved, far from the origin too, and in another unit: differences of coordinates are taken in float64."""
     instances = UniformGenerator(9, 2)(4, np.random.default_rng(0))
-    moved = Instances.from_arrays(7 + 3 * instances.depot.numpy(), 7 + 3 * instances.tasks.numpy(), max_distance=6.0, n_uavs=2)
-    for one, two in zip(FleetGeometry.of(static_of(instances)), FleetGeometry.of(static_of(moved)), strict=True):
-        th.testing.assert_close(one, two, atol=1e-5, rtol=0)
+    points = offset + 3 * instances.depot.numpy(), offset + 3 * instances.tasks.numpy()
+    moved = Instances.from_arrays(*points, max_distance=6.0, n_uavs=2)
+    for geometry in (FleetGeometry, MoveGeometry):
+        for one, two in zip(geometry.of(static_of(instances)), geometry.of(static_of(moved)), strict=True):
+            th.testing.assert_close(one, two, atol=1e-5, rtol=0)
 
 
 def test_features_of_a_move() -> None:
@@ -105,7 +108,7 @@ def test_features_of_a_fleet() -> None:
     features = geometry.features(fleet, task, geometry.owners(task, th.tensor([[[0, 0, -1, -1]]])))[0, 0]
     f = FleetFeature
     found = [features[0, feature].item() for feature in (f.LOAD, f.OVERLOAD, f.EMPTY, f.VOTES)]
-    assert found == pytest.approx([1.5, 1.5 - FULL, 0.0, 1.0])
+    assert found == pytest.approx([1.5, 1.5 - _FULL, 0.0, 1.0])
     named = (f.NEAREST, f.CENTROID, f.LAST, f.PERIMETER, f.GROWTH)
     nearest, to_centroid, to_last, perimeter, grown = (features[0, feature].item() for feature in named)
     assert nearest == pytest.approx(0.4) and to_last == pytest.approx(0.4)
@@ -159,7 +162,7 @@ def test_neighbors_come_before_the_task_and_are_nearest(instances: Instances) ->
             known = geometry.neighbor_distance[row, task] < FARTHEST
             assert (geometry.neighbors[row, task][known] < task).all()
             all_before = sorted(min(math.dist(points[task], points[other]), FARTHEST) for other in range(task))
-            expected = [distance for distance in all_before[:N_NEIGHBORS] if distance < FARTHEST - 1e-6]
+            expected = [distance for distance in all_before[:_N_NEIGHBORS] if distance < FARTHEST - 1e-6]
             found = [distance for distance in geometry.neighbor_distance[row, task].tolist() if distance < FARTHEST - 1e-6]
             assert found == pytest.approx(expected, abs=1e-5)
 

@@ -21,7 +21,7 @@ from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, WARM_START_FOLDER
 
 pytest.importorskip("numba")
 from sb3_uav.training import imitation
-from sb3_uav.training.imitation import Lesson, good_tours, imitate, search_lessons, varied
+from sb3_uav.training.imitation import Lesson, _search_lessons, _varied, good_tours, imitate
 
 WARM_START: dict[str, Any] = {"n_subsets": 40, "n_updates": 4, "batch_size": 8}
 
@@ -77,22 +77,22 @@ def test_an_interrupted_imitation_goes_on(
     allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_searched: int, n_updated: int
 ) -> None:
     """With the same result, and without doing anything twice that was saved."""
-    monkeypatch.setattr(imitation, "CHUNK_SIZE", 20)
-    monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
+    monkeypatch.setattr(imitation, "_CHUNK_SIZE", 20)
+    monkeypatch.setattr(imitation, "_SAVE_EVERY", 2)
 
     def learned(folder: Path | None) -> th.Tensor:
         router = make_policy(RouterPolicy)
         imitate(router, allocator, MixtureGenerator(30, 4), np.random.default_rng(3), 90, 7, 8, folder=folder)
         return parameters(router)
 
-    searches, updates = Mock(side_effect=good_tours), Mock(side_effect=varied)
+    searches, updates = Mock(side_effect=good_tours), Mock(side_effect=_varied)
     with monkeypatch.context() as patch:
         patch.setattr(imitation, "good_tours", searches)
         expected = learned(None)
     n_all = searches.call_count
     with monkeypatch.context() as patch:
         counts = {"good_tours": n_searched, "varied": n_updated}
-        for name, function in (("good_tours", good_tours), ("varied", varied)):
+        for name, function in (("good_tours", good_tours), ("varied", _varied)):
 
             def interrupted(*args: Any, name: str = name, function: Any = function) -> Any:
                 counts[name] -= 1
@@ -105,7 +105,7 @@ def test_an_interrupted_imitation_goes_on(
             learned(tmp_path)
     searches.reset_mock()
     monkeypatch.setattr(imitation, "good_tours", searches)
-    monkeypatch.setattr(imitation, "varied", updates)
+    monkeypatch.setattr(imitation, "_varied", updates)
     assert th.equal(learned(tmp_path), expected)
     n_again = 7 - (4 if n_updated == 5 else 0)
     assert updates.call_count == n_again
@@ -129,7 +129,7 @@ def test_wrong_progress(allocator: Any, tmp_path: Path) -> None:
 
 
 def test_progress_of_another_network(allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imitation, "SAVE_EVERY", 1)
+    monkeypatch.setattr(imitation, "_SAVE_EVERY", 1)
 
     def learn(embed_dim: int) -> None:
         router = make_policy(RouterPolicy, embed_dim=embed_dim)
@@ -182,7 +182,7 @@ def test_damaged_lessons_are_named(change: Any, allocator: Any, tmp_path: Path) 
 
 @pytest.mark.parametrize("change", [dict(n_updates="many"), dict(router=None), dict(optimizer={"state": 3})])
 def test_damaged_updates_are_named(change: Any, allocator: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imitation, "SAVE_EVERY", 1)
+    monkeypatch.setattr(imitation, "_SAVE_EVERY", 1)
 
     def learn() -> None:
         imitate(
@@ -197,9 +197,9 @@ def test_damaged_updates_are_named(change: Any, allocator: Any, tmp_path: Path, 
 
 def test_variants_are_the_same_tours(allocator: Any) -> None:
     """Some of the rows, turned, some of them backwards: as long, and as many tasks."""
-    lesson = search_lessons(allocator, UniformGenerator(30, 4), np.random.default_rng(0), 60, 16)[0]
+    lesson = _search_lessons(allocator, UniformGenerator(30, 4), np.random.default_rng(0), 60, 16)[0]
     for seed in range(4):
-        variant = varied(lesson, np.random.default_rng(seed), 16)
+        variant = _varied(lesson, np.random.default_rng(seed), 16)
         assert 0 < len(variant.tours) <= len(lesson.tours)
         for row in range(len(variant.tours)):
             length = tour_length(variant, row)
@@ -259,7 +259,7 @@ def test_its_starts_with_it_once(tmp_path: Any, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize("room", ["training", "solvers"])
 def test_its_goes_on_with_it(room: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that was interrupted in its warm start resumes in another folder, and ends like an uninterrupted one."""
-    monkeypatch.setattr(imitation, "SAVE_EVERY", 2)
+    monkeypatch.setattr(imitation, "_SAVE_EVERY", 2)
     expected = make_its(save_path=str(tmp_path / "expected"))
     make_model().learn(10**9, callback=expected)
     calls = []
@@ -268,9 +268,9 @@ def test_its_goes_on_with_it(room: str, tmp_path: Any, monkeypatch: pytest.Monke
         calls.append(1)
         if len(calls) == 4:
             raise KeyboardInterrupt
-        return varied(*args)
+        return _varied(*args)
 
-    monkeypatch.setattr(imitation, "varied", interrupted)
+    monkeypatch.setattr(imitation, "_varied", interrupted)
     with pytest.raises(KeyboardInterrupt):
         make_model().learn(10**9, callback=make_its(save_path=str(tmp_path / "first")))
     first = tmp_path / "first" / CHECKPOINT_FOLDER
@@ -312,7 +312,7 @@ def zero_router(router: Any, allocator: Any, generator: Any, rng: np.random.Gene
         ({"a.b": 3}, "warm_start: the arguments of a.b must be a mapping, found 3"),
         ({"n_tours": 3}, "warm_start: these arguments do not fit .*n_tours"),
         ({"sb3_uav.nothing.at_all": {}}, "warm_start is 'sb3_uav.nothing.at_all', which cannot be imported"),
-        ({"sb3_uav.training.imitation.WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
+        ({"sb3_uav.training.imitation._WARM_UP": {}}, "warm_start: these arguments do not fit .*WARM_UP"),
         ({"sb3_uav.training.imitation.imitate": {"n_tours": 3}}, "warm_start: these arguments do not fit .*n_tours"),
     ],
 )

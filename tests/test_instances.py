@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from instance_helpers import arrays, assert_equal, poked
 
 from sb3_uav.envs import Instances, RoutePlanningEnv, Schedule, UniformGenerator, check_schedule, nearest_feasible, plan_tours
-from sb3_uav.envs.instances import TENSOR_FIELDS
+from sb3_uav.envs.instances import _TENSOR_FIELDS
 from sb3_uav.training.fixed_set_returns import fingerprint
 
 # Validation
@@ -113,7 +113,7 @@ def test_from_arrays_copies() -> None:
     given_arrays = arrays()
     before = {name: np.copy(array) for name, array in given_arrays.items()}
     instances = Instances.from_arrays(**given_arrays)
-    for name in TENSOR_FIELDS:
+    for name in _TENSOR_FIELDS:
         getattr(instances, name).zero_()
         assert np.array_equal(given_arrays[name], before[name]), name
 
@@ -246,7 +246,7 @@ def test_concatenate_refuses_different_fleets(small: Instances) -> None:
 def test_to(small: Instances) -> None:
     assert small.to("cpu") is small and small.device == th.device("cpu")
     moved = small.to("meta")
-    assert moved.device == th.device("meta") and {getattr(moved, name).device.type for name in TENSOR_FIELDS} == {"meta"}
+    assert moved.device == th.device("meta") and {getattr(moved, name).device.type for name in _TENSOR_FIELDS} == {"meta"}
 
 
 def test_reachable() -> None:
@@ -264,7 +264,7 @@ def test_digests_stay_as_result_files_store_them(small: Instances) -> None:
     assert padded.digest() == "5041946ddb479bdcd8c81de0fbcb11b71e74f3f94983f89d4d1538fee057d250"
     assert fingerprint(padded, 3) == "ebed545e3f447bcc"
     assert padded.digest() == padded[:].digest() != replace(padded, n_uavs=3).digest()
-    for name in TENSOR_FIELDS:
+    for name in _TENSOR_FIELDS:
         changed = getattr(padded, name).clone()
         changed[0] = 1 - changed[0].to(changed.dtype) if changed.dtype != th.bool else ~changed[0]
         assert replace(padded, **{name: changed}).digest() != padded.digest()

@@ -8,6 +8,7 @@ import pytest
 from its_runs import N_TASKS, PAPER, equal, learn, make_allocator, make_env, make_its, trace
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common.epoch_log import LOG_FILE
 from sb3_uav.envs import (
     check_schedule,
     plan_tours,
@@ -16,7 +17,6 @@ from sb3_uav.envs import (
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.epoch_log import LOG_FILE
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
 from sb3_uav.training.router_trainer import RouterTrainer
 

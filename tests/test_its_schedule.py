@@ -12,7 +12,7 @@ from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
-from sb3_uav.training.its_schedule import PAPER_STRATEGIES, STRATEGIES, EpochSchedule
+from sb3_uav.training.its_schedule import _STRATEGIES, PAPER_STRATEGIES, EpochSchedule
 from sb3_uav.training.subsets import AllocatedSubsets
 
 pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
 
 
 def test_the_papers_names_of_strategies_mean_the_same():
-    assert set(PAPER_STRATEGIES.values()) == set(STRATEGIES)
+    assert set(PAPER_STRATEGIES.values()) == set(_STRATEGIES)
     for paper, readable in PAPER_STRATEGIES.items():
         assert make_its(strategy=paper).strategy == readable
         assert make_its(strategy=paper).schedule == make_its(strategy=readable).schedule

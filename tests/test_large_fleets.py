@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from instance_helpers import arrays, assert_equal
 
 from sb3_uav.envs import Instances, RoutePlanningEnv, Schedule, TaskAllocationEnv, UniformGenerator, check_schedule
-from sb3_uav.envs.allocation import AllocationProblem, plan_tours, split_tasks, useful_allocation
+from sb3_uav.envs.allocation import AllocationProblem, _useful_allocation, plan_tours, split_tasks
 from sb3_uav.envs.routing import nearest_feasible
 
 absurd = pytest.mark.parametrize("n_uavs", [10**6, 10**9])
@@ -89,7 +89,7 @@ def test_an_environment_and_its_picture_with_a_million_uavs() -> None:
 @given(instances=instance_batches(), seed=seeds, n_samples=st.integers(1, 3), partial=st.booleans())
 def test_leaving_out_useless_uavs_changes_no_tour(instances: Instances, seed: int, n_samples: int, partial: bool) -> None:
     assignment = random_assignment(instances, n_samples, np.random.default_rng(seed), partial)
-    fewer, numbered = useful_allocation(instances, assignment)
+    fewer, numbered = _useful_allocation(instances, assignment)
     assert fewer.n_uavs == instances.useful_fleet == min(instances.n_uavs, instances.n_tasks)
     assert th.equal(
         plan_tours(fewer, numbered, nearest_feasible).value, plan_tours(instances, assignment, nearest_feasible).value

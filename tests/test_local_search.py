@@ -270,7 +270,7 @@ def test_improvement_beats_repair(valued: bool) -> None:
 
 def test_improvement_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Even without any time it gets at least as far as one repair, if that may end."""
-    monkeypatch.setattr(local_search, "LAST_REPAIR_SECONDS", math.inf)
+    monkeypatch.setattr(local_search, "_LAST_REPAIR_SECONDS", math.inf)
     instance = medium()
     repaired = repair(instance, Schedule([]))
     for seconds in (0.0, 1e-6, 0.1):
@@ -283,7 +283,7 @@ def test_the_last_repair_ends(given: float | None, monkeypatch: pytest.MonkeyPat
     """However long it would go on, if there was a time limit at all."""
     rounds = iter(range(40))
     monkeypatch.setattr(kernels, "descend", lambda *_: next(rounds) < 30)
-    monkeypatch.setattr(local_search, "LAST_REPAIR_SECONDS", 0.0)
+    monkeypatch.setattr(local_search, "_LAST_REPAIR_SECONDS", 0.0)
     improve(medium(), Schedule([]), given)
     assert next(rounds) == (31 if given is None else 0)
 

@@ -19,8 +19,8 @@ from sb3_uav.envs import Instances, UniformGenerator
 from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.evaluation import evaluate
 from sb3_uav.solvers import NoScheduleError, make_solver
-from sb3_uav.solvers.milp import MILP, Places, paper_program, program_size
-from sb3_uav.solvers.programs import FREE_LICENSE_SIZE, Answer, Backend
+from sb3_uav.solvers.milp import MILP, _paper_program, _Places, _program_size
+from sb3_uav.solvers.programs import _FREE_LICENSE_SIZE, _Answer, _Backend
 from sb3_uav.solvers.unavailable import UnavailableError
 
 pytestmark = pytest.mark.usefixtures("ticks")
@@ -64,22 +64,22 @@ def test_cycles_within_the_solvers_tolerance(spec: str) -> None:
     assert (found, result.bound) == pytest.approx((1.0, 1.0))
 
 
-class Pretender(Backend):
+class Pretender(_Backend):
     """
     A backend that reports what it is told to, once per round.
 
     :param answers: What it says
     """
 
-    def __init__(self, *answers: Answer) -> None:
+    def __init__(self, *answers: _Answer) -> None:
         self.answers = list(answers)
 
-    def solve(self, program: Any, time_limit: float, threads: int, seed: int) -> Answer:
+    def solve(self, program: Any, time_limit: float, threads: int, seed: int) -> _Answer:
         return self.answers.pop(0)
 
 
-@pytest.mark.parametrize("answer, bound", [(Answer(None, math.inf), 9.0), (Answer(None, 5.5), 5.5)])
-def test_without_an_incumbent_milp_says_so_and_keeps_the_bound(answer: Answer, bound: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("answer, bound", [(_Answer(None, math.inf), 9.0), (_Answer(None, 5.5), 5.5)])
+def test_without_an_incumbent_milp_says_so_and_keeps_the_bound(answer: _Answer, bound: float, tmp_path: Path) -> None:
     """An empty schedule would look like a result; an evaluation records a failure with the bound."""
     solver = MILP(7.0)
     solver.backend = Pretender(answer, answer)
@@ -102,7 +102,7 @@ def test_what_is_feasible_of_an_incumbent_is_kept() -> None:
     # Arcs are (0, 1), (0, 2), (0, 3), (1, 0), (1, 2), (1, 3), (2, 0), (2, 1), (2, 3), (3, 0), (3, 1), (3, 2).
     columns = np.array([1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 1] + [1] * 3 + [0] * 3, dtype=float)
     solver = MILP()
-    solver.backend = Pretender(Answer(columns, 3.0), Answer(None, 2.5))
+    solver.backend = Pretender(_Answer(columns, 3.0), _Answer(None, 2.5))
     found, result = solved(solver, instance)
     assert (found, result.bound) == (1.0, 2.5)
 
@@ -121,15 +121,15 @@ def test_the_time_limit_is_kept_and_the_bound_holds() -> None:
 @pytest.mark.parametrize("n_tasks, n_uavs", [(1, 1), (1, 3), (4, 2), (7, 3), (30, 2), (20, 4), (16, 6)])
 def test_size_of_the_program(n_tasks: int, n_uavs: int) -> None:
     reduced = ReducedInstance.of(UniformGenerator(n_tasks, n_uavs, max_distance=9.0)(1, np.random.default_rng(0)))
-    program = paper_program(Places.of(reduced), n_uavs)
-    assert program_size(n_tasks, n_uavs) == (len(program.objective), len(program.lower))
+    program = _paper_program(_Places.of(reduced), n_uavs)
+    assert _program_size(n_tasks, n_uavs) == (len(program.objective), len(program.lower))
     assert len(program.starts) == len(program.lower) + 1 == len(program.upper) + 1
     assert program.starts[-1] == len(program.columns) == len(program.coefficients)
 
 
 @pytest.mark.parametrize("n_uavs, largest", [(2, 30), (4, 20), (6, 16)])
 def test_sizes_of_the_free_license(n_uavs: int, largest: int) -> None:
-    assert max(program_size(largest, n_uavs)) <= FREE_LICENSE_SIZE < max(program_size(largest + 1, n_uavs))
+    assert max(_program_size(largest, n_uavs)) <= _FREE_LICENSE_SIZE < max(_program_size(largest + 1, n_uavs))
 
 
 def test_too_large_for_any_machine() -> None:
@@ -148,7 +148,7 @@ def test_gurobi_and_its_license() -> None:
     for row in range(4):
         (gurobi, result), (highs, _) = solved(solver, batch, row), solved("milp", batch, row)
         assert gurobi == highs == pytest.approx(result.bound)
-    if solver.backend.size_limit != FREE_LICENSE_SIZE:
+    if solver.backend.size_limit != _FREE_LICENSE_SIZE:
         pytest.skip(f"gurobipy {gurobipy.gurobi.version()} has a full license here")
     large = Instances.concatenate([batch.pad(40), UniformGenerator(40, 2, max_distance=9.0)(1, np.random.default_rng(0))])
     with pytest.raises(

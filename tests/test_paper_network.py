@@ -11,7 +11,7 @@ from policy_helpers import UNSET, count, draw, make_policy, shake_statistics
 from torch import nn
 
 from sb3_uav.envs import RoutePlanningEnv, TaskAllocationEnv
-from sb3_uav.policies.encoder import AttentionEncoder, NodeNorm
+from sb3_uav.policies.encoder import AttentionEncoder, _NodeNorm
 
 
 def test_paper_preset_parameter_counts():
@@ -140,7 +140,7 @@ def test_paper_router_forward_pass_by_hand():
 
 
 def test_batch_norm_learns_from_real_nodes_only():
-    norm: Any = NodeNorm("batch", 4)
+    norm: Any = _NodeNorm("batch", 4)
     nodes = th.randn(3, 5, 4)
     mask = th.tensor([[1, 1, 1, 1, 1], [1, 1, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=th.bool)
     reference = nn.BatchNorm1d(4)

@@ -16,7 +16,7 @@ from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator
 from sb3_uav.envs.render import UAV_COLORS
 from sb3_uav.plots import MapPanel, learning_curves, plot_learning_curves, plot_schedule, plot_schedules
-from sb3_uav.plots.learning_curves import read_its_log
+from sb3_uav.plots.learning_curves import _read_its_log
 from sb3_uav.plots.schedule_map import schedules_figure
 
 ITS_LOG = """\
@@ -186,7 +186,7 @@ def test_curves_on_disk(log: Path, tmp_path: Path) -> None:
 def test_epochs_are_read_in_order(log: Path) -> None:
     header, *rows = ITS_LOG.splitlines()
     log.write_text("\n".join([header, *reversed(rows)]) + "\n")
-    epochs = read_its_log(log)
+    epochs = _read_its_log(log)
     assert [epoch.epoch for epoch in epochs["router"]] == [1, 2, 3, 4]
     assert [epoch.phase for epoch in epochs["allocator"]] == ["intensive", "alternate"]
 

@@ -18,7 +18,7 @@ from torch import nn
 from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.policies import AllocatorExtractor, AllocatorPolicy, RouterExtractor, RouterPolicy
 from sb3_uav.policies.encoder import SelfAttention
-from sb3_uav.policies.settings import PRESETS, NetworkSettings
+from sb3_uav.policies.settings import _PRESETS, NetworkSettings
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -45,7 +45,7 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         optimizer_kwargs=dict(eps=1e-6, weight_decay=0.1),
     )
     policy = make_policy(level, **given)
-    signature, defaults = inspect.signature(type(policy)).parameters, asdict(PRESETS["paper"])
+    signature, defaults = inspect.signature(type(policy)).parameters, asdict(_PRESETS["paper"])
     settings = set(defaults)
     assert all(given[key] != (defaults[key] if key in settings else signature[key].default) for key in given)
     policy.save(tmp_path / "policy.pth")
@@ -197,8 +197,8 @@ def test_unknown_settings_are_named(level):
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_settings_come_from_the_preset_unless_given(level):
-    assert make_policy(level, **UNSET).settings == PRESETS["default"]
-    assert make_policy(level, preset="paper", **UNSET, relative=True).settings == replace(PRESETS["paper"], relative=True)
+    assert make_policy(level, **UNSET).settings == _PRESETS["default"]
+    assert make_policy(level, preset="paper", **UNSET, relative=True).settings == replace(_PRESETS["paper"], relative=True)
 
 
 @pytest.mark.parametrize("level", LEVELS)

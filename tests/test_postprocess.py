@@ -131,7 +131,7 @@ def test_without_numba(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_polish_without_pyvrp(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ruin and recreate alone, which ends with a repair of at least one round on any machine."""
     monkeypatch.setitem(sys.modules, "pyvrp", None)
-    monkeypatch.setattr("sb3_uav.local_search.search.LAST_REPAIR_SECONDS", math.inf)
+    monkeypatch.setattr("sb3_uav.local_search.search._LAST_REPAIR_SECONDS", math.inf)
     assert check_schedule(instances, 0, polish(instances[0], Schedule([]), 0.05)).objective > 0
 
 

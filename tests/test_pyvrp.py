@@ -37,7 +37,7 @@ def test_pyvrp_with_uneven_values(kind: str) -> None:
 @needs_pyvrp
 def test_pyvrp_without_a_feasible_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tours that are too long are left out, where penalties are too low to avoid them."""
-    monkeypatch.setattr(pyvrp_search, "PENALTY_PER_PRIZE", 1)
+    monkeypatch.setattr(pyvrp_search, "_PENALTY_PER_PRIZE", 1)
     generator = np.random.default_rng(3)
     for n_uavs in (1, 2, 3):
         values = 10.0 ** generator.uniform(-6, 6, 80)

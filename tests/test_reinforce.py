@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
 
-from sb3_uav.common.statistics import significantly_positive, student_t_quantile
+from sb3_uav.common.statistics import _student_t_quantile, significantly_positive
 from sb3_uav.envs import (
     UniformGenerator,
     collected_value,
@@ -276,7 +276,7 @@ def test_rollout_baseline_is_replaced_only_when_better():
 def test_paired_t_test_against_tables():
     table = {(0.95, 9): 1.8331, (0.95, 29): 1.6991, (0.975, 19): 2.0930, (0.95, 999): 1.6464, (0.99, 99): 2.3646}
     for (probability, degrees), expected in table.items():
-        assert student_t_quantile(probability, degrees) == pytest.approx(expected, abs=1e-3)
+        assert _student_t_quantile(probability, degrees) == pytest.approx(expected, abs=1e-3)
     gain = np.array([0.2, -0.1, 0.3, 0.1, 0.0, 0.2, 0.1, -0.2, 0.3, 0.1])
     # t = 1.94 for 9 degrees of freedom: p = 0.042.
     assert significantly_positive(gain, 0.05) and not significantly_positive(gain, 0.04)

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecChec
 from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
 from sb3_uav.envs.generators import FixedGenerator
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.reinforce.drivers import FUSED_SETTINGS, STEP_LOOP_SETTINGS
+from sb3_uav.reinforce.drivers import _FUSED_SETTINGS, _STEP_LOOP_SETTINGS
 from sb3_uav.reinforce.recognition import find_problem, why_unrecognized
 
 
@@ -139,5 +139,5 @@ def test_settings_without_effect_are_reported():
 
 def test_defaults_of_the_settings_are_those_of_the_constructor():
     parameters = inspect.signature(REINFORCE.__init__).parameters
-    for name, default in {**FUSED_SETTINGS, **STEP_LOOP_SETTINGS}.items():
+    for name, default in {**_FUSED_SETTINGS, **_STEP_LOOP_SETTINGS}.items():
         assert parameters[name].default == default, name

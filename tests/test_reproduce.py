@@ -34,9 +34,9 @@ from sb3_uav.reproduce.paper import (
     SIZES,
     paper_figure,
 )
-from sb3_uav.reproduce.scales import SMOKE, Scenario, scenarios
+from sb3_uav.reproduce.scales import _SMOKE, Scenario, scenarios
 from sb3_uav.reproduce.targets import TARGETS
-from sb3_uav.reproduce.training_processes import TrainingProcess, train_in_process, train_pairs
+from sb3_uav.reproduce.training_processes import _train_in_process, _TrainingProcess, train_pairs
 from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
@@ -198,7 +198,7 @@ def test_fig3(out: Path) -> None:
         n_uavs, n_tasks = (int(number) for number in row["Situation"][1:].split("-"))
         counts = [int(count) for count in row["Tasks by UAV"].split()]
         assert int(row["Tasks"]) == n_tasks // 10 and sum(counts) == int(row["Visited"]) <= n_tasks // 10
-        assert len(counts) <= n_uavs and float(row["Total length"]) <= n_uavs * SMOKE.max_distance
+        assert len(counts) <= n_uavs and float(row["Total length"]) <= n_uavs * _SMOKE.max_distance
 
 
 @pytest.mark.slow
@@ -311,7 +311,7 @@ def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def job(folder: Path, strategy: str = ITS, **its: Any) -> PairTraining:
-    entry = training_entry(SMOKE, SMOKE.recipe, Scenario(4, 80), strategy)
+    entry = training_entry(_SMOKE, _SMOKE.recipe, Scenario(4, 80), strategy)
     entry["callback"][0]["sb3_uav.training.ITSCallback"].update(its)
     return PairTraining(Scenario(4, 80), strategy, entry, folder / "training", folder / "models" / strategy, 0, "cpu", 1)
 
@@ -370,22 +370,22 @@ def test_a_failed_process_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     receiver, sender = multiprocessing.Pipe(duplex=False)
     with monkeypatch.context() as patch, pytest.raises(SystemExit):
         patch.setattr(signal, "signal", lambda *_: None)
-        train_in_process(broken, sender)
+        _train_in_process(broken, sender)
     with pytest.raises(TrainingError, match=r"failed: .*did you mean 'learning_rate'"):
-        TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
+        _TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
     sender.close()
     with pytest.raises(TrainingError, match="U4-80, its failed: its process died; was it out of memory"):
-        TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
+        _TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
 def test_pairs_of_other_settings_are_not_used(out: Path, tmp_path: Path) -> None:
     shutil.copytree(out / "models/U4-N80/ITS", tmp_path / "models/U4-N80/ITS")
     with pytest.raises(TrainingError, match="was trained with other settings or another seed; delete it"):
-        Models(SMOKE, tmp_path, seed=1).get([(Scenario(4, 80), ITS)])
+        Models(_SMOKE, tmp_path, seed=1).get([(Scenario(4, 80), ITS)])
     (tmp_path / "models/U4-N80/ITS/training.json").write_text("{")
     with pytest.raises(TrainingError, match=r"training\.json: is damaged"):
-        Models(SMOKE, tmp_path).get([(Scenario(4, 80), ITS)])
+        Models(_SMOKE, tmp_path).get([(Scenario(4, 80), ITS)])
 
 
 @pytest.mark.parametrize(

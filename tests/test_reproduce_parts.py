@@ -19,15 +19,15 @@ from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.reproduce import paper
 from sb3_uav.reproduce.evaluator import Evaluator
-from sb3_uav.reproduce.figures_3_to_7 import read_logged_curves
+from sb3_uav.reproduce.figures_3_to_7 import _read_logged_curves
 from sb3_uav.reproduce.origin import Origin
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
 from sb3_uav.reproduce.pairs import Model
 from sb3_uav.reproduce.paper import paper_figure, paper_tables
-from sb3_uav.reproduce.scales import CPU, PAPER, SCALES, SMOKE, Scale, Scenario, scenarios
+from sb3_uav.reproduce.scales import _CPU, _PAPER, _SMOKE, SCALES, Scale, Scenario, scenarios
 from sb3_uav.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
-from sb3_uav.reproduce.table_layout import best, lay_out
-from sb3_uav.reproduce.tables_1_to_4 import phase_times, seconds
+from sb3_uav.reproduce.table_layout import _best, lay_out
+from sb3_uav.reproduce.tables_1_to_4 import _phase_times, _seconds
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS, NO_INTENSIVE
 
 pytest.importorskip("rl_zoo3")
@@ -102,29 +102,29 @@ def test_the_copied_cells_are_named() -> None:
 
 
 def test_untrained_sizes_are_solved_by_the_nearest_pair() -> None:
-    assert [SMOKE.trained_for(Scenario(6, size)).n_tasks for size in paper.SIZES] == [80, 80, 200, 200, 200, 200]
-    assert [PAPER.trained_for(Scenario(4, size)).n_tasks for size in (*paper.SIZES, 600, 1500)] == [*paper.SIZES, 500, 500]
+    assert [_SMOKE.trained_for(Scenario(6, size)).n_tasks for size in paper.SIZES] == [80, 80, 200, 200, 200, 200]
+    assert [_PAPER.trained_for(Scenario(4, size)).n_tasks for size in (*paper.SIZES, 600, 1500)] == [*paper.SIZES, 500, 500]
 
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=str)
 def test_scales_are_complete(scale: Any) -> None:
     assert set(scale.n_instances) == {*paper.SIZES, *paper.LARGER_SIZES}
     assert set(scale.exact_sizes) | set(scale.trained_sizes) <= set(paper.SIZES)
-    assert scale is PAPER or all(0 < scale.time_limits[name] <= 60 for name in ("milp", "ortools-gls", "pyvrp"))
+    assert scale is _PAPER or all(0 < scale.time_limits[name] <= 60 for name in ("milp", "ortools-gls", "pyvrp"))
 
 
 def test_training_entries() -> None:
     """At the paper's scale the zoo's own entry, at the others the changes of the recipe, at every level."""
-    entry = training_entry(PAPER, PAPER.recipe, Scenario(6, 300), ITS)
+    entry = training_entry(_PAPER, _PAPER.recipe, Scenario(6, 300), ITS)
     its = entry["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (entry["n_envs"], entry["instances_per_epoch"], entry["learning_rate"]) == (256, 1_280_000, 1e-4)
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
     assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
-    cpu = training_entry(CPU, CPU.recipe, Scenario(4, 300), NO_INTENSIVE)
+    cpu = training_entry(_CPU, _CPU.recipe, Scenario(4, 300), NO_INTENSIVE)
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (cpu["instances_per_epoch"], cpu["baseline"], its["router"]["baseline"]) == (320, "shared", "shared")
     assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("no-intensive", 24, 8)
-    assert training_entry(SMOKE, SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
+    assert training_entry(_SMOKE, _SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
 
 
 def training(scale: Scale, scenario: Scenario, strategy: str) -> PairTraining:
@@ -139,13 +139,13 @@ def test_the_independent_router_is_trained_as_long_as_that_of_its(scale: Scale) 
         independent, its = (training(scale, scenario, strategy).schedule for strategy in (INDEPENDENT, ITS))
         assert independent.n_router_epochs == independent.n_pretraining_epochs == its.n_router_epochs
         assert its.n_router_epochs > its.n_pretraining_epochs and independent.n_epochs == its.n_epochs
-    assert training(PAPER, Scenario(4, 80), INDEPENDENT).schedule.n_router_epochs == 5 + 8 + 92
+    assert training(_PAPER, Scenario(4, 80), INDEPENDENT).schedule.n_router_epochs == 5 + 8 + 92
 
 
 def test_pairs_of_earlier_versions(tmp_path: Path) -> None:
     """The paper's names of the strategies mean the same; routers of DL-DRL-I that were trained too briefly are not used."""
     for strategy, old_name, fits in ((NO_INTENSIVE, "ITS/intensive", True), (INDEPENDENT, "independent", False)):
-        job = replace(training(SMOKE, Scenario(4, 80), strategy), model_folder=tmp_path / strategy)
+        job = replace(training(_SMOKE, Scenario(4, 80), strategy), model_folder=tmp_path / strategy)
         entry = json.loads(json.dumps(job.entry))
         entry["callback"][0]["sb3_uav.training.ITSCallback"]["strategy"] = old_name
         job.model_folder.mkdir()
@@ -164,16 +164,16 @@ def test_tables_have_the_papers_names_of_the_strategies() -> None:
 
 def test_test_instances() -> None:
     """Fewer are the first of more; seeds and scenarios differ."""
-    evaluator = Evaluator(CPU, Path("unused"))
+    evaluator = Evaluator(_CPU, Path("unused"))
     some, more = (evaluator.instances(Scenario(4, 80), n_instances=n) for n in (3, 5))
     assert th.equal(some.tasks, more[:3].tasks) and th.equal(some.depot, more[:3].depot)
     others = [
-        Evaluator(CPU, Path("unused"), seed=1).instances(Scenario(4, 80), n_instances=3),
+        Evaluator(_CPU, Path("unused"), seed=1).instances(Scenario(4, 80), n_instances=3),
         evaluator.instances(Scenario(6, 80), n_instances=3),
         evaluator.instances(Scenario(4, 80), 1234, 3),
     ]
     assert all(not th.equal(some.tasks, other.tasks) for other in others)
-    assert len(evaluator.instances(Scenario(4, 80))) == CPU.n_instances[80]
+    assert len(evaluator.instances(Scenario(4, 80))) == _CPU.n_instances[80]
     assert float(more.max_distance[0]) == 2.0 and more.n_tasks == 80
 
 
@@ -181,16 +181,16 @@ def test_test_instances() -> None:
 
 
 def test_best_of_what_is_shown() -> None:
-    assert best(["1.00", "2.00", "-", "2.00"]) == [1, 3]
-    assert best(["1.00", "2.00", "-"], smallest=True) == [0]
+    assert _best(["1.00", "2.00", "-", "2.00"]) == [1, 3]
+    assert _best(["1.00", "2.00", "-"], smallest=True) == [0]
     # Small times are shown with more digits than others.
-    assert [seconds(time) for time in (0.0012, 0.00119, 0.2)] == ["0.0012", "0.0012", "0.20"]
-    assert best(["0.0012", "0.0038", "0.0012", "0.20"], smallest=True) == [0, 2]
+    assert [_seconds(time) for time in (0.0012, 0.00119, 0.2)] == ["0.0012", "0.0012", "0.20"]
+    assert _best(["0.0012", "0.0038", "0.0012", "0.20"], smallest=True) == [0, 2]
 
 
 def test_a_method_alone_is_not_the_best() -> None:
     """There is nothing that it is better than."""
-    assert best(["0.00", "-", "-"], smallest=True) == best(["-", "5.00"]) == best(["-", "-"]) == []
+    assert _best(["0.00", "-", "-"], smallest=True) == _best(["-", "5.00"]) == _best(["-", "-"]) == []
     columns = [*map(Column, ("Number of tasks", "Measure", "Source")), Column("Gurobi", "30"), Column("DL-DRL", "30")]
     table = Table("Table II", "Results", [*columns, Column("OR-tools", "500"), Column("DL-DRL", "500")])
     table.add(["80", "Obj.", "ours", "5.00", "-", "1.00", "2.00"])
@@ -270,7 +270,7 @@ def test_pictures_of_the_same_data_are_equal(committed: Path) -> None:
 
 
 def test_pictures_say_where_they_come_from_without_the_name_of_the_machine() -> None:
-    origin = Origin.of("sb3-uav reproduce fig5", CPU, 3)
+    origin = Origin.of("sb3-uav reproduce fig5", _CPU, 3)
     (machine,) = (line for line in origin.lines if line.startswith("Machine: "))
     assert re.fullmatch(r"Machine: \w+ \w+, \d+ CPUs", machine)
     assert platform.release() not in " ".join(origin.lines) and platform.node() not in machine
@@ -311,17 +311,17 @@ def logged(tmp_path: Path) -> Model:
 
 def test_phase_times(logged: Model) -> None:
     """Per instance, without the first epoch and without the router's instances in its own time."""
-    assert phase_times(logged) == pytest.approx((0.18, 4 / 50, 2 / 50, 100))
+    assert _phase_times(logged) == pytest.approx((0.18, 4 / 50, 2 / 50, 100))
     # What earlier versions wrote does not tell them apart.
     lines = [line.rpartition(",")[0] for line in LOG.splitlines()]
     (logged.folder / "its_log.csv").write_text("\n".join(lines) + "\n")
-    upper, lower, generation, _ = phase_times(logged)
+    upper, lower, generation, _ = _phase_times(logged)
     assert upper == pytest.approx(0.18) and np.isnan(lower) and np.isnan(generation)
 
 
 def test_curves(logged: Model) -> None:
     assert logged.its_log is not None
-    curves = read_logged_curves(logged.its_log)
+    curves = _read_logged_curves(logged.its_log)
     assert curves["allocator"].cost.tolist() == [-30.0, -31.0]
     assert curves["allocator"].minutes.tolist() == pytest.approx([18 / 60, 41 / 60])
     assert curves["router"].phase.count("pre-training") == 1 and curves["router"].minutes[-1] == pytest.approx(47 / 60)
@@ -343,6 +343,6 @@ def test_curves(logged: Model) -> None:
 def test_damaged_logs(content: str | bytes, message: str, logged: Model) -> None:
     assert logged.its_log is not None
     logged.its_log.write_bytes(content.encode() if isinstance(content, str) else content)
-    for read in (lambda: phase_times(logged), lambda: read_logged_curves(logged.folder / "its_log.csv")):
+    for read in (lambda: _phase_times(logged), lambda: _read_logged_curves(logged.folder / "its_log.csv")):
         with pytest.raises(ValueError, match=re.escape(str(logged.its_log)) + message):
             read()

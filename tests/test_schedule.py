@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from sb3_uav.envs import InfeasibleScheduleError, Instances, Schedule, ScheduleReport, check_schedule
 from sb3_uav.envs import schedule as schedule_module
-from sb3_uav.envs.schedule import schedule_from_json, schedule_to_json
+from sb3_uav.envs.schedule import _schedule_from_json, schedule_to_json
 
 
 @pytest.fixture
@@ -195,7 +195,7 @@ def test_json_round_trip(solver: str, row: int, routes: list[list[int]], objecti
         "objective": objective,
         "lengths": [1.5, 2.0],
     }
-    assert schedule_from_json(json.loads(line), "schedules.jsonl line 1") == (solver, row, schedule)
+    assert _schedule_from_json(json.loads(line), "schedules.jsonl line 1") == (solver, row, schedule)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_json_round_trip(solver: str, row: int, routes: list[list[int]], objecti
 )
 def test_json_with_missing_fields(record: Any) -> None:
     with pytest.raises(ValueError, match=r"^s\.jsonl:7: a schedule needs the fields 'solver', 'instance' and 'routes', found"):
-        schedule_from_json(record, "s.jsonl:7")
+        _schedule_from_json(record, "s.jsonl:7")
 
 
 @pytest.mark.parametrize(
@@ -231,4 +231,4 @@ def test_json_with_wrong_types(changes: dict[str, Any]) -> None:
     with pytest.raises(
         ValueError, match=r"^s\.jsonl:7: 'routes' must be lists of task indices and 'instance' an index, found"
     ):
-        schedule_from_json({"solver": "a", "instance": 0, "routes": [[1]], **changes}, "s.jsonl:7")
+        _schedule_from_json({"solver": "a", "instance": 0, "routes": [[1]], **changes}, "s.jsonl:7")

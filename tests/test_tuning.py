@@ -23,21 +23,21 @@ from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, sample_ppo_params
 
 from sb3_uav.zoo import train
-from sb3_uav.zoo.experiment import OUR_ALGORITHMS
-from sb3_uav.zoo.tuning import OTHER_SPACES, OUR_SPACES, is_ours, register_search_spaces
+from sb3_uav.zoo.experiment import _OUR_ALGORITHMS
+from sb3_uav.zoo.tuning import _OTHER_SPACES, _OUR_SPACES, _is_ours, register_search_spaces
 
 ROUTING, ALLOCATION = "RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
-ALGORITHMS = {**rl_zoo3.ALGOS, **OUR_ALGORITHMS}
+ALGORITHMS = {**rl_zoo3.ALGOS, **_OUR_ALGORITHMS}
 
 
 def draw(algo: str, seed: int) -> tuple[optuna.Trial, dict[str, Any]]:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=seed))
     trial = study.ask()
-    return trial, OUR_SPACES[algo][0](trial, 0, 4, {})
+    return trial, _OUR_SPACES[algo][0](trial, 0, 4, {})
 
 
-@pytest.mark.parametrize("algo", sorted(OUR_SPACES))
+@pytest.mark.parametrize("algo", sorted(_OUR_SPACES))
 def test_spaces_leave_network_and_rollout_alone(algo):
     accepted = set(inspect.signature(ALGORITHMS[algo]).parameters)
     for seed in range(20):
@@ -45,13 +45,13 @@ def test_spaces_leave_network_and_rollout_alone(algo):
         assert set(hyperparams) <= accepted - {"policy", "policy_kwargs", "gamma", "n_steps", "n_envs"}
         assert {"learning_rate", "max_grad_norm", "ent_coef"} < set(hyperparams)
         # What --trial-id will make of the same trial.
-        assert OUR_SPACES[algo][1](trial.params) == hyperparams
+        assert _OUR_SPACES[algo][1](trial.params) == hyperparams
         assert 1e-4 <= hyperparams["learning_rate"] <= 5e-3 and 1e-5 <= hyperparams["ent_coef"] <= 0.03
         assert hyperparams.get("batch_size", 256) in [2**power for power in range(8, 14)]
         assert hyperparams.get("gae_lambda", 1.0) >= 0.9 and hyperparams.get("n_samples", 2) in (2, 4, 8, 16)
 
 
-@pytest.mark.parametrize("algo", sorted(OUR_SPACES))
+@pytest.mark.parametrize("algo", sorted(_OUR_SPACES))
 def test_every_draw_makes_an_algorithm(algo):
     env = BatchedVecEnv([lambda: RoutePlanningEnv(5)] * 2)
     for seed in range(8):
@@ -69,12 +69,12 @@ class Narrower(RoutePlanningEnv):
 def test_other_environments_keep_the_spaces_of_rl_zoo3():
     if "Narrower-v0" not in gym.registry:
         gym.register("Narrower-v0", entry_point=f"{__name__}:Narrower")
-    assert is_ours(ROUTING) and is_ours(ALLOCATION) and is_ours("Narrower-v0") and not is_ours("CartPole-v1")
+    assert _is_ours(ROUTING) and _is_ours(ALLOCATION) and _is_ours("Narrower-v0") and not _is_ours("CartPole-v1")
     register_search_spaces("CartPole-v1")
     assert HYPERPARAMS_SAMPLER["ppo"] is sample_ppo_params is HYPERPARAMS_SAMPLER["ppo_mask"]
     register_search_spaces(ROUTING)
-    assert HYPERPARAMS_SAMPLER["ppo"] is OUR_SPACES["ppo"][0] and HYPERPARAMS_CONVERTER["ppo"] is OUR_SPACES["ppo"][1]
-    assert OTHER_SPACES.keys() == OUR_SPACES.keys() <= HYPERPARAMS_SAMPLER.keys()
+    assert HYPERPARAMS_SAMPLER["ppo"] is _OUR_SPACES["ppo"][0] and HYPERPARAMS_CONVERTER["ppo"] is _OUR_SPACES["ppo"][1]
+    assert _OTHER_SPACES.keys() == _OUR_SPACES.keys() <= HYPERPARAMS_SAMPLER.keys()
 
 
 # ------------------------------------------------------------------------------------------ trials

@@ -11,7 +11,7 @@ from sb3_uav.common.optional import require
 from sb3_uav.zoo.dependencies import require_zoo
 
 
-def make_parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav compare",
         description="Train PPO, MaskablePPO and REINFORCE from their YAMLs at an equal budget of environment steps, evaluate "
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises ImportError: If a package that comparisons need is not installed
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    settings = vars(make_parser().parse_args(arguments))
+    settings = vars(_make_parser().parse_args(arguments))
     # Report missing packages before the long run.
     require_zoo("A comparison")
     require("matplotlib.figure", "A comparison", "plots")

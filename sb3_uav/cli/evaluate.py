@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from sb3_uav.envs import Instances
     from sb3_uav.solvers import Solver
 
-OK, INFEASIBLE, USER_ERROR, FAILED = 0, 1, 2, 3
-EPILOG = """\
+_OK, _INFEASIBLE, _USER_ERROR, _FAILED = 0, 1, 2, 3
+_EPILOG = """\
 solvers:
   An unknown NAME makes the error message list all solvers, an unknown KEY all options of that solver.
   NAME:KEY=VALUE,... sets options of a solver; name=TEXT is its label in tables and files. A value with a comma stands in
@@ -41,14 +41,14 @@ exit code:
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     from sb3_uav.solvers.decoding import DECODINGS
 
     parser = argparse.ArgumentParser(
         prog="sb3-uav evaluate",
         description="Evaluate trained pairs and other solvers on the same instances. Every schedule is checked\n"
         "by the same independent code, and solvers are compared instance by instance.",
-        epilog=EPILOG,
+        epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--instances", type=Path, nargs="+", required=True, metavar="NPZ", help="instance files")
@@ -85,7 +85,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
+def _load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
     """
     :param paths: The files
     :return: Their instances by the stem of the file, or by the whole path where stems are alike
@@ -102,7 +102,7 @@ def load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
     return {name: Instances.load(path) for name, path in zip(names, paths, strict=True)}
 
 
-def make_solvers(args: argparse.Namespace) -> list[Solver]:
+def _make_solvers(args: argparse.Namespace) -> list[Solver]:
     """
     :param args: Of ``sb3-uav evaluate``
     :return: The solvers that they ask for, the trained pair first; in place of one that cannot be made, one that refuses all
@@ -187,18 +187,18 @@ class ProgressLines:
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: Arguments; those of the process when None
-    :return: Exit code, see :data:`EPILOG`
+    :return: Exit code, see :data:`_EPILOG`
     :raises ValueError: If an argument or a file is wrong
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that evaluations need is not installed
     """
-    args = make_parser().parse_args(argv)
+    args = _make_parser().parse_args(argv)
     from sb3_uav.evaluation.run import evaluate, find_reference
     from sb3_uav.evaluation.table import print_table, require_rich
 
     # What may be missing or wrong is found before the long run, not after it.
     require_rich()
-    instances = load_instances(args.instances)
+    instances = _load_instances(args.instances)
     for name, batch in instances.items():
         n_real, n_reachable = int(batch.task_mask.sum()), int(batch.reachable().sum())
         if n_reachable < n_real:
@@ -207,7 +207,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 "depot; no schedule can visit them.",
                 file=sys.stderr,
             )
-    solvers = make_solvers(args)
+    solvers = _make_solvers(args)
     reference = find_reference(solvers, args.reference)
     try:
         with ProgressLines() as progress:
@@ -234,5 +234,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     for failure in failures:
         print(f"sb3-uav: {failure}", file=sys.stderr)
     if violations:
-        return INFEASIBLE
-    return FAILED if failures else OK
+        return _INFEASIBLE
+    return _FAILED if failures else _OK

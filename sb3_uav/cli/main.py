@@ -12,7 +12,7 @@ import sb3_uav
 from sb3_uav.common.errors import run_command
 
 # Each command has its own parser: its arguments go to the main function of that module.
-FORWARDED = {
+_FORWARDED = {
     "train": ("sb3_uav.cli.train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
     "enjoy": ("sb3_uav.cli.enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
     "evaluate": ("sb3_uav.cli.evaluate", "evaluate zips and solvers on the same instances"),
@@ -23,25 +23,25 @@ FORWARDED = {
 }
 
 
-def make_parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="sb3-uav", description="Multi-UAV task scheduling with DL-DRL.")
     parser.add_argument("--version", action="version", version=f"sb3-uav {sb3_uav.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, (_, text) in FORWARDED.items():
+    for name, (_, text) in _FORWARDED.items():
         commands.add_parser(name, help=text, add_help=False)
     return parser
 
 
-def run(argv: Sequence[str]) -> int:
+def _run(argv: Sequence[str]) -> int:
     """
     :param argv: Name of a command and its arguments
     :return: Exit code
     """
-    if not argv or argv[0] not in FORWARDED:
+    if not argv or argv[0] not in _FORWARDED:
         # Prints the help, the version or an error, and exits.
-        make_parser().parse_args(argv[:1])
+        _make_parser().parse_args(argv[:1])
     # Not by argparse.REMAINDER, which swallows options of this parser that come first.
-    return import_module(FORWARDED[argv[0]][0]).main(list(argv[1:]))
+    return import_module(_FORWARDED[argv[0]][0]).main(list(argv[1:]))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -50,8 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: Exit code, see :func:`~sb3_uav.common.errors.run_command`
     """
     argv = sys.argv[1:] if argv is None else argv
-    prog = f"sb3-uav {argv[0]}" if argv and argv[0] in FORWARDED else "sb3-uav"
-    return run_command(prog, partial(run, argv))
+    prog = f"sb3-uav {argv[0]}" if argv and argv[0] in _FORWARDED else "sb3-uav"
+    return run_command(prog, partial(_run, argv))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from sb3_uav.zoo.dependencies import require_zoo
 if TYPE_CHECKING:
     from sb3_uav.reproduce.session import Session
 
-EPILOG = """\
+_EPILOG = """\
 what is written:
   DIR/table1.md, .tex, .csv       the table, the paper's figures beside ours; the same for the data of figures
   DIR/fig3.png, .pdf              the figure, drawn from fig3_schedules.csv, fig4_curves.csv, fig5_curves.csv or its own table
@@ -46,12 +46,12 @@ def _indented(name: str, text: str) -> str:
     return textwrap.fill(f"  {name:<22}{text}", 100, subsequent_indent=" " * 24)
 
 
-def make_parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav reproduce",
         description="Reproduce tables and figures of the DL-DRL paper: train missing pairs, evaluate them beside "
         "the paper's baselines, and write our figures beside the paper's.",
-        epilog="\n".join(["scales:", *(_indented(scale.name, scale.text) for scale in SCALES.values()), "", EPILOG]),
+        epilog="\n".join(["scales:", *(_indented(scale.name, scale.text) for scale in SCALES.values()), "", _EPILOG]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises ImportError: If a package that this needs is not installed
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    args = make_parser().parse_args(arguments)
+    args = _make_parser().parse_args(arguments)
     for name, value, least in (("--seed", args.seed, 0), ("--jobs", args.jobs, 1), ("--num-threads", args.num_threads, 1)):
         if value is not None and value < least:
             raise ValueError(f"{name} is {value}; it must be at least {least}.")

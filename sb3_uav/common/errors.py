@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
-OK, USER_ERROR, INTERRUPTED = 0, 2, 130
+_OK, _USER_ERROR, _INTERRUPTED = 0, 2, 130
 
 
 def run_command(prog: str, function: Callable[[], int | None]) -> int:
@@ -17,13 +17,13 @@ def run_command(prog: str, function: Callable[[], int | None]) -> int:
     :return: Exit code: that of the command (0 on success), 2 if the input was wrong, 130 after Ctrl-C
     """
     try:
-        return function() or OK
+        return function() or _OK
     except (ValueError, OSError, ImportError) as error:
         print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return USER_ERROR
+        return _USER_ERROR
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _INTERRUPTED
 
 
 def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:

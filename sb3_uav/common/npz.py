@@ -10,8 +10,8 @@ from typing import IO
 import numpy as np
 
 # Upper bound of the compression ratio of deflate, which np.savez_compressed uses (https://zlib.net/zlib_tech.html).
-GREATEST_COMPRESSION = 1032
-SUFFIX = ".npy"
+_GREATEST_COMPRESSION = 1032
+_SUFFIX = ".npy"
 
 
 def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
@@ -29,8 +29,8 @@ def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
         with path.open("rb") as stream, zipfile.ZipFile(stream) as file:
             arrays = {}
             for member in file.infolist():
-                place = f"array '{member.filename.removesuffix(SUFFIX)}': "
-                arrays[member.filename.removesuffix(SUFFIX)] = _read_array(file, member)
+                place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
+                arrays[member.filename.removesuffix(_SUFFIX)] = _read_array(file, member)
             return arrays
     except Exception as error:
         # Given damaged bytes, zipfile and numpy's header parser (tokenize, ast) raise almost any exception, even MemoryError.
@@ -45,11 +45,11 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     :return: The array in it
     :raises Exception: Any kind of exception, if the file is damaged or not an array
     """
-    if not member.filename.endswith(SUFFIX):
+    if not member.filename.endswith(_SUFFIX):
         raise ValueError("the name does not end in .npy")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError("it is compressed in a way that numpy does not use")
-    if member.file_size > GREATEST_COMPRESSION * member.compress_size + 1:
+    if member.file_size > _GREATEST_COMPRESSION * member.compress_size + 1:
         raise ValueError(
             f"{member.compress_size} compressed bytes cannot hold the {member.file_size} bytes that the archive declares"
         )

@@ -1,17 +1,31 @@
 """
-Access to private attributes of Stable-Baselines3's objects from outside a subclass; no other module does that.
+Access to private attributes of Stable-Baselines3's objects from outside a subclass, and what differs between its versions.
 
-Each function links the upstream code that it relies on.
+No other module does either. Each function links the upstream code that it relies on.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from stable_baselines3.common import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+
+
+def linear_schedule(start: float) -> Schedule:
+    """
+    A schedule that falls linearly from ``start`` to 0 over the whole training.
+
+    ``LinearSchedule``, which SB3 2.6 has not, in place of ``get_linear_fn``, which it deprecates:
+    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/utils.py
+
+    :param start: Value at the beginning
+    :return: A function of the progress that remains, 1 to 0
+    """
+    if hasattr(utils, "LinearSchedule"):
+        return utils.LinearSchedule(start=start, end=0.0, end_fraction=1.0)
+    return utils.get_linear_fn(start, 0.0, 1.0)
 
 
 def n_updates(model: BaseAlgorithm) -> int:
@@ -62,16 +76,3 @@ def forget_last_observation(model: OnPolicyAlgorithm) -> None:
     :param model: An on-policy algorithm
     """
     model._last_obs = None
-
-
-def constructor_parameters(policy: BasePolicy) -> dict[str, Any]:
-    """
-    The constructor arguments of another policy of the same architecture.
-
-    ``BaseModel._get_constructor_parameters``, used by ``save`` and ``load`` of policies:
-    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/policies.py
-
-    :param policy: Any SB3 or sb3-contrib policy
-    :return: Keyword arguments for its class
-    """
-    return policy._get_constructor_parameters()

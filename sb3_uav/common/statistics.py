@@ -9,10 +9,10 @@ import numpy as np
 
 CONFIDENCE = 0.95
 # Tabulated 97.5 % quantiles for 1 to 9 degrees of freedom, where the expansion in student_t_quantile is not accurate.
-FEW_DEGREES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+_FEW_DEGREES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 
-def student_t_quantile(probability: float, degrees: int) -> float:
+def _student_t_quantile(probability: float, degrees: int) -> float:
     """
     Quantile of Student's t distribution by the Cornish-Fisher expansion around the normal one.
 
@@ -33,12 +33,12 @@ def student_t_quantile(probability: float, degrees: int) -> float:
     return sum(terms)
 
 
-def confidence_quantile(degrees: int) -> float:
+def _confidence_quantile(degrees: int) -> float:
     """
     :param degrees: Degrees of freedom, at least 1
     :return: The quantile of Student's t distribution for a two-sided interval of :data:`CONFIDENCE`
     """
-    return FEW_DEGREES[degrees - 1] if degrees <= len(FEW_DEGREES) else student_t_quantile((1 + CONFIDENCE) / 2, degrees)
+    return _FEW_DEGREES[degrees - 1] if degrees <= len(_FEW_DEGREES) else _student_t_quantile((1 + CONFIDENCE) / 2, degrees)
 
 
 def confidence_halfwidth(samples: np.ndarray) -> np.ndarray:
@@ -52,7 +52,7 @@ def confidence_halfwidth(samples: np.ndarray) -> np.ndarray:
     n = len(samples)
     if n < 2:
         return np.full(samples.shape[1:], np.nan)
-    return confidence_quantile(n - 1) * np.std(samples, axis=0, ddof=1) / math.sqrt(n)
+    return _confidence_quantile(n - 1) * np.std(samples, axis=0, ddof=1) / math.sqrt(n)
 
 
 def significantly_positive(gain: np.ndarray, alpha: float) -> bool:
@@ -67,4 +67,4 @@ def significantly_positive(gain: np.ndarray, alpha: float) -> bool:
     mean, deviation = float(gain.mean()), float(gain.std(ddof=1))
     if deviation == 0.0:
         return mean > 0.0
-    return mean / (deviation / math.sqrt(n)) > student_t_quantile(1 - alpha, n - 1)
+    return mean / (deviation / math.sqrt(n)) > _student_t_quantile(1 - alpha, n - 1)

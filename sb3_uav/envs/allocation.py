@@ -18,7 +18,7 @@ from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import sweep_order
 
 UNASSIGNED = -1
-TASK_ORDERS = ("input", "sweep")
+_TASK_ORDERS = ("input", "sweep")
 
 
 class AllocationState(NamedTuple):
@@ -73,7 +73,7 @@ class AllocationDynamics(Dynamics):
         rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
         rows = finished.any(1)
         if rows.any():
-            value = planned_value(self.instances[rows], assignment[rows], self.router)
+            value = _planned_value(self.instances[rows], assignment[rows], self.router)
             rewards[rows] = value.where(finished[rows], 0.0)
         return AllocationState(assignment, task, done, state.action_mask), rewards
 
@@ -152,7 +152,7 @@ def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> P
     return PlannedTours(tours.view(*shape, nodes.shape[1]), value)
 
 
-def useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
+def _useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
     """
     Remove UAVs that cannot have a task, so that an absurdly large fleet takes no memory.
 
@@ -171,14 +171,14 @@ def useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Inst
     return replace(instances, n_uavs=instances.useful_fleet), numbered
 
 
-def planned_value(instances: Instances, assignment: th.Tensor, router: Router) -> th.Tensor:
+def _planned_value(instances: Instances, assignment: th.Tensor, router: Router) -> th.Tensor:
     """
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
     :return: ``(batch, n_samples)`` float64, total value of the tasks on the planned tours
     """
-    return plan_tours(*useful_allocation(instances, assignment), router).value
+    return plan_tours(*_useful_allocation(instances, assignment), router).value
 
 
 def schedules(tours: th.Tensor) -> list[Schedule]:
@@ -213,8 +213,8 @@ class AllocationProblem(Problem):
 
     @task_order.setter
     def task_order(self, task_order: str) -> None:
-        if task_order not in TASK_ORDERS:
-            raise ValueError(f"task_order is {task_order!r}; choose one of {TASK_ORDERS}.")
+        if task_order not in _TASK_ORDERS:
+            raise ValueError(f"task_order is {task_order!r}; choose one of {_TASK_ORDERS}.")
         self._task_order = task_order
 
     def arrange(self, instances: Instances) -> Instances:
@@ -243,7 +243,7 @@ class AllocationProblem(Problem):
         }
 
     def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        return planned_value(instances, actions, self.router)
+        return _planned_value(instances, actions, self.router)
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
         rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
@@ -257,7 +257,7 @@ class AllocationProblem(Problem):
     def routes(self, instance: Instances, actions: list[int]) -> list[list[int]]:
         assignment = np.full((1, 1, instance.n_tasks), UNASSIGNED)
         assignment[0, 0, : len(actions)] = actions
-        instance, allocation = useful_allocation(instance, th.from_numpy(assignment))
+        instance, allocation = _useful_allocation(instance, th.from_numpy(assignment))
         # There are no tours before the end: these are the tasks of each UAV, in the order of their assignment.
         if len(actions) < int(instance.task_mask.sum()):
             uavs = allocation[0, 0].tolist()

@@ -31,7 +31,7 @@ class InstanceGenerator(Protocol):
         ...
 
 
-def check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
+def _check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
     """
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
@@ -74,7 +74,7 @@ class UniformGenerator:
     max_distance: float = 2.0
 
     def __post_init__(self) -> None:
-        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         points = rng.random((batch_size, self.n_tasks + 1, 2))
@@ -101,7 +101,7 @@ class ClusteredGenerator:
     spread: float = 0.07
 
     def __post_init__(self) -> None:
-        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
         if self.n_clusters < 1 or not self.spread >= 0:
             raise ValueError(f"n_clusters must be >= 1 and spread >= 0, found {self.n_clusters} and {self.spread}.")
 
@@ -115,12 +115,12 @@ class ClusteredGenerator:
 
 
 # With fewer tasks per UAV, almost every allocation visits all tasks, and there is little to learn.
-TASKS_PER_UAV = 12
+_TASKS_PER_UAV = 12
 # Exponent that favors small instances, which are almost as instructive as large ones and cheaper; 1 is log-uniform.
-SMALL_SIZES = 1.5
+_SMALL_SIZES = 1.5
 # Exponent that reduces the batch size of larger instances. With 1, all batches would hold equally many tasks; less than that
 # is better, because small tensors spend more time on launching operations.
-FEWER_INSTANCES = 0.85
+_FEWER_INSTANCES = 0.85
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class MixtureGenerator:
     min_tasks: int = 40
 
     def __post_init__(self) -> None:
-        check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
         if self.min_tasks < 1:
             raise ValueError(f"min_tasks is {self.min_tasks}; give at least 1.")
 
@@ -159,10 +159,10 @@ class MixtureGenerator:
         """
         n_uavs = int(rng.integers(min(2, self.n_uavs), self.n_uavs, endpoint=True))
         least = min(self.min_tasks, self.n_tasks)
-        fewest = min(max(least, TASKS_PER_UAV * n_uavs), self.n_tasks)
-        n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** SMALL_SIZES))
+        fewest = min(max(least, _TASKS_PER_UAV * n_uavs), self.n_tasks)
+        n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** _SMALL_SIZES))
         factor = 1.0 if rng.random() < 0.5 else rng.uniform(0.6, 1.6)
-        n_instances = max(round(batch_size * (least / n_tasks) ** FEWER_INSTANCES), 2)
+        n_instances = max(round(batch_size * (least / n_tasks) ** _FEWER_INSTANCES), 2)
         return UniformGenerator(n_tasks, n_uavs, self.max_distance * factor)(n_instances, rng)
 
 
@@ -221,7 +221,7 @@ class FixedGenerator:
         return self.instances[rng.integers(len(self.instances), size=batch_size)]
 
 
-GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator, "mixture": MixtureGenerator}
+_GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator, "mixture": MixtureGenerator}
 
 
 def make_generator(
@@ -243,6 +243,6 @@ def make_generator(
     """
     if instances is not None:
         return FixedGenerator(instances if isinstance(instances, Instances) else Instances.load(instances))
-    if distribution not in GENERATORS:
-        raise ValueError(f"distribution is {distribution!r}; choose one of {sorted(GENERATORS)}.")
-    return GENERATORS[distribution](n_tasks=n_tasks, n_uavs=n_uavs, max_distance=max_distance)
+    if distribution not in _GENERATORS:
+        raise ValueError(f"distribution is {distribution!r}; choose one of {sorted(_GENERATORS)}.")
+    return _GENERATORS[distribution](n_tasks=n_tasks, n_uavs=n_uavs, max_distance=max_distance)

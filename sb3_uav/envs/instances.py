@@ -18,13 +18,13 @@ from sb3_uav.envs.array_input import advice_on, as_numbers, per_instance, row_in
 from sb3_uav.envs.distances import distance_limit, euclidean
 
 # A depot is far from the origin beyond this many maximum flight distances, of which float32 still resolves 4e-6 there.
-FAR_FROM_ORIGIN = 64.0
+_FAR_FROM_ORIGIN = 64.0
 
 # Larger fleets would not fit the integers of files and solvers.
 MAX_UAVS = 2**31 - 1
 
 # The tensors of Instances. The order matters for digests, which result files store.
-TENSOR_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
+_TENSOR_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ class Instances:
 
     def _map(self, function: Callable[[th.Tensor], th.Tensor]) -> Instances:
         """Apply a function to every tensor."""
-        fields: dict[str, Any] = {name: function(getattr(self, name)) for name in TENSOR_FIELDS}
+        fields: dict[str, Any] = {name: function(getattr(self, name)) for name in _TENSOR_FIELDS}
         return replace(self, **fields)
 
     def replace_rows(self, rows: th.Tensor, others: Instances) -> Instances:
@@ -225,7 +225,7 @@ class Instances:
         :return: A copy with the other instances in these rows
         """
         fields: dict[str, Any] = {
-            name: getattr(self, name).index_copy(0, rows, getattr(others, name)) for name in TENSOR_FIELDS
+            name: getattr(self, name).index_copy(0, rows, getattr(others, name)) for name in _TENSOR_FIELDS
         }
         return replace(self, **fields)
 
@@ -278,7 +278,7 @@ class Instances:
             raise ValueError(f"Cannot join instances with different n_uavs: {sorted(fleets)}.")
         n_tasks = max(part.n_tasks for part in parts)
         padded = [part.pad(n_tasks) for part in parts]
-        fields: dict[str, Any] = {name: th.cat([getattr(part, name) for part in padded]) for name in TENSOR_FIELDS}
+        fields: dict[str, Any] = {name: th.cat([getattr(part, name) for part in padded]) for name in _TENSOR_FIELDS}
         return replace(padded[0], **fields)
 
     def digest(self, header: str | None = None) -> str:
@@ -290,7 +290,7 @@ class Instances:
         """
         header = f"{self.n_uavs} {tuple(self.task_mask.shape)}\n" if header is None else header
         digest = hashlib.sha256(header.encode())
-        for name in TENSOR_FIELDS:
+        for name in _TENSOR_FIELDS:
             digest.update(getattr(self, name).detach().cpu().numpy().tobytes())
         return digest.hexdigest()
 
@@ -304,7 +304,7 @@ class Instances:
 
         :return: The translated instances
         """
-        is_far = self.depot.abs().amax(1) > FAR_FROM_ORIGIN * self.max_distance
+        is_far = self.depot.abs().amax(1) > _FAR_FROM_ORIGIN * self.max_distance
         shift = self.depot.where(is_far[:, None], 0.0)
         return replace(self, depot=self.depot - shift, tasks=self.tasks - shift[:, None])
 
@@ -327,7 +327,7 @@ class Instances:
             raise ValueError(f"{path}: there are no instances to save; a file holds at least one.")
         path = Path(path)
         path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        numbers = {name: getattr(self, name).detach().cpu() for name in TENSOR_FIELDS if name != "task_mask"}
+        numbers = {name: getattr(self, name).detach().cpu() for name in _TENSOR_FIELDS if name != "task_mask"}
         arrays = {name: field.double().numpy() for name, field in numbers.items()}
         arrays["n_uavs"] = np.full(self.batch_size, self.n_uavs)
         if not self.task_mask.all():
@@ -350,7 +350,7 @@ class Instances:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
         arrays = read_npz(path, "write it again")
-        known = (*TENSOR_FIELDS, "n_uavs")
+        known = (*_TENSOR_FIELDS, "n_uavs")
         unknown = [name for name in arrays if name not in known]
         if unknown:
             raise ValueError(f"{path}: unknown array '{unknown[0]}'; {advice_on(unknown[0], known)}.")

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.instances import Instances
 
-StateT = TypeVar("StateT", bound="State")
+StateT = TypeVar("StateT", bound="_State")
 
 # The keys of an observation that do not change during an episode.
 STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
@@ -27,7 +27,7 @@ class Stage(Enum):
     FINISHED = "all UAVs are back at the depot"
 
 
-class State(Protocol):
+class _State(Protocol):
     """The fields that every state has: tensors with leading dimensions (batch, n_samples)."""
 
     @property

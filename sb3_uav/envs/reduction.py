@@ -15,10 +15,10 @@ from sb3_uav.envs.schedule import Schedule
 
 # Solvers leave this part of the tolerance of the dynamics and of the checker to the rounding of sums of distances: far more
 # than they can err by, hundreds of legs long.
-MARGIN = 1e-3
-USABLE_TOLERANCE = (1.0 - MARGIN) * DISTANCE_TOLERANCE
+_MARGIN = 1e-3
+USABLE_TOLERANCE = (1.0 - _MARGIN) * DISTANCE_TOLERANCE
 # Rounding of values that are multiples of one another, as a part of them.
-MULTIPLE_TOLERANCE = 1e-12
+_MULTIPLE_TOLERANCE = 1e-12
 # The maximum flight distance in integers, for costs.
 RESOLUTION = 2_000_000
 # The same for limits: so fine that rounding up every leg of a tour, of up to 17,000, stays within the usable tolerance. Even,
@@ -129,7 +129,7 @@ class ReducedInstance:
             with np.errstate(over="ignore"):
                 multiples = self.values / unit
             whole = np.rint(multiples)
-            if whole.max() <= finest and (np.abs(multiples - whole) <= MULTIPLE_TOLERANCE * multiples).all():
+            if whole.max() <= finest and (np.abs(multiples - whole) <= _MULTIPLE_TOLERANCE * multiples).all():
                 counts = whole.astype(np.int64)
                 break
         return counts // np.gcd.reduce(counts) * smallest_prize

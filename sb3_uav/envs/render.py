@@ -21,15 +21,15 @@ logger = logging.getLogger(__name__)
 UAV_COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C6D31", "#000000")
 
 # Legend entries of the tasks that are on no route.
-REMAINING_TASKS = {Stage.ASSIGNING: "not yet assigned", Stage.FLYING: "not yet visited", Stage.FINISHED: "skipped"}
+_REMAINING_TASKS = {Stage.ASSIGNING: "not yet assigned", Stage.FLYING: "not yet visited", Stage.FINISHED: "skipped"}
 # The legend of a larger fleet would not fit below the map.
-MAX_UAVS_NAMED = 12
-LEGEND_COLUMNS = 2
+_MAX_UAVS_NAMED = 12
+_LEGEND_COLUMNS = 2
 
 # Sides of the map, in units of the points' extent.
-BORDER = 1.08
+_BORDER = 1.08
 # Inches: a figure, the frame around the map, and a line of the legend below it.
-FIGURE_WIDTH, FIGURE_HEIGHT, MARGIN, LEGEND_LINE_HEIGHT = 5.0, 5.6, 0.15, 0.185
+_FIGURE_WIDTH, FIGURE_HEIGHT, _MARGIN, LEGEND_LINE_HEIGHT = 5.0, 5.6, 0.15, 0.185
 
 
 def require_matplotlib() -> Any:
@@ -90,9 +90,9 @@ def draw_map(
     visited = {task for route in routes for task in route}
     hollow = [task for task in range(len(tasks)) if task not in visited]
     circles = dict(s=22, facecolors="none", edgecolors="0.55", linewidths=0.9, zorder=2)
-    axes.scatter(*tasks[hollow].T, **circles, label=f"{_counted(len(hollow))} {REMAINING_TASKS[stage]}")
+    axes.scatter(*tasks[hollow].T, **circles, label=f"{_counted(len(hollow))} {_REMAINING_TASKS[stage]}")
     _set_limits(axes, np.vstack([depot, tasks]))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=LEGEND_COLUMNS, fontsize=8, frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=_LEGEND_COLUMNS, fontsize=8, frameon=False)
     if title:
         axes.set_title(title, fontsize=11)
 
@@ -104,14 +104,14 @@ def legend_lines(routes: Sequence[Sequence[int]]) -> int:
     """
     named = len(_named_uavs(routes))
     # Depot and hollow tasks have entries too.
-    return math.ceil((named + (named < len(routes)) + 2) / LEGEND_COLUMNS)
+    return math.ceil((named + (named < len(routes)) + 2) / _LEGEND_COLUMNS)
 
 
 def _named_uavs(routes: Sequence[Sequence[int]]) -> set[int]:
     """The UAVs to name in the legend: all of a small fleet, the first busy ones of a large one."""
-    if len(routes) <= MAX_UAVS_NAMED:
+    if len(routes) <= _MAX_UAVS_NAMED:
         return set(range(len(routes)))
-    return set(itertools.islice((uav for uav, route in enumerate(routes) if len(route) > 0), MAX_UAVS_NAMED))
+    return set(itertools.islice((uav for uav, route in enumerate(routes) if len(route) > 0), _MAX_UAVS_NAMED))
 
 
 def _distances(depot: np.ndarray, points: np.ndarray, maximum: float, stage: Stage) -> str:
@@ -133,7 +133,7 @@ def _set_limits(axes: Any, points: np.ndarray) -> None:
     """Show a square around the points, without ticks."""
     low, high = points.min(0), points.max(0)
     # Any size will do for a single point.
-    half = BORDER * float((high - low).max() or 1.0) / 2
+    half = _BORDER * float((high - low).max() or 1.0) / 2
     for set_limits, middle in zip((axes.set_xlim, axes.set_ylim), (low + high) / 2, strict=True):
         set_limits(middle - half, middle + half)
     axes.set_aspect("equal")
@@ -162,9 +162,9 @@ class MapFigure:
                 logger.warning("No display was found, so render_mode='human' shows nothing; use render_mode='rgb_array'.")
                 self.interactive = False
         if self.interactive:
-            self.figure = plt.figure(figsize=(FIGURE_WIDTH, FIGURE_HEIGHT))
+            self.figure = plt.figure(figsize=(_FIGURE_WIDTH, FIGURE_HEIGHT))
         else:
-            self.figure = matplotlib.figure.Figure(figsize=(FIGURE_WIDTH, FIGURE_HEIGHT), dpi=100)
+            self.figure = matplotlib.figure.Figure(figsize=(_FIGURE_WIDTH, FIGURE_HEIGHT), dpi=100)
         self.axes = self.figure.add_subplot()
 
     def draw(self, episodes: Episodes, row: int) -> None:
@@ -178,12 +178,12 @@ class MapFigure:
         self.axes.clear()
         draw_map(self.axes, episodes.instances, row, routes, stage=episodes.stage(row))
         # Not tight_layout, which starts from the last layout and cuts off long legends.
-        legend = 2 * MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
+        legend = 2 * _MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
         self.figure.subplots_adjust(
-            left=MARGIN / FIGURE_WIDTH,
-            right=1 - MARGIN / FIGURE_WIDTH,
+            left=_MARGIN / _FIGURE_WIDTH,
+            right=1 - _MARGIN / _FIGURE_WIDTH,
             bottom=legend / FIGURE_HEIGHT,
-            top=1 - MARGIN / FIGURE_HEIGHT,
+            top=1 - _MARGIN / FIGURE_HEIGHT,
         )
         self.axes.set_anchor("N")
 

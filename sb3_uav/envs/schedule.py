@@ -111,7 +111,7 @@ def schedule_to_json(solver: str, row: int, schedule: Schedule, report: Schedule
     }
 
 
-def schedule_from_json(record: Any, source: str) -> tuple[str, int, Schedule]:
+def _schedule_from_json(record: Any, source: str) -> tuple[str, int, Schedule]:
     """
     :param record: One parsed line of a ``schedules.jsonl``
     :param source: File and line, named in errors

@@ -18,7 +18,7 @@ from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.problem import Problem
 
 # Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
-TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
+_TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
 
 
 def strip_wrappers(env: gym.Env) -> gym.Env:
@@ -28,7 +28,7 @@ def strip_wrappers(env: gym.Env) -> gym.Env:
     """
     inner: Any = env
     # Only exact types: a subclass may behave differently.
-    while type(inner) in TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
+    while type(inner) in _TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
         inner = inner.env
     return inner
 

@@ -22,7 +22,7 @@ from sb3_uav.evaluation.results import one_line
 from sb3_uav.solvers.base import NoScheduleError, OneByOneSolver, Solver, SolverResult
 
 # One being solved, and the next one, so that no process waits for the main process.
-TASKS_PER_PROCESS = 2
+_TASKS_PER_PROCESS = 2
 
 
 class Failure(NamedTuple):
@@ -47,7 +47,7 @@ class Failure(NamedTuple):
         return cls(text if text and is_ours else f"{type(error).__name__}: {text}", bound)
 
 
-class Task(NamedTuple):
+class _Task(NamedTuple):
     """
     One instance for a worker, as NumPy arrays, because torch passes tensors through shared memory.
 
@@ -67,7 +67,7 @@ class Task(NamedTuple):
     seed: int
 
     @classmethod
-    def of(cls, solver: OneByOneSolver, instances: Instances, row: int, time_limit: float | None, seed: int) -> Task:
+    def of(cls, solver: OneByOneSolver, instances: Instances, row: int, time_limit: float | None, seed: int) -> _Task:
         fields = vars(instances[row])
         arrays = {name: value.numpy() for name, value in fields.items() if isinstance(value, th.Tensor)}
         return cls(solver, instances.n_uavs, arrays, row, time_limit, seed)
@@ -75,10 +75,10 @@ class Task(NamedTuple):
     def run(self) -> SolverResult | Failure:
         arrays = {name: th.from_numpy(value) for name, value in self.arrays.items()}
         instance = Instances(n_uavs=self.n_uavs, **arrays)
-        return solve_row(self.solver, instance, self.row, self.time_limit, self.seed)
+        return _solve_row(self.solver, instance, self.row, self.time_limit, self.seed)
 
 
-def solve_row(
+def _solve_row(
     solver: OneByOneSolver, instance: Instances, row: int, time_limit: float | None, seed: int
 ) -> SolverResult | Failure:
     """
@@ -179,9 +179,9 @@ class Runner:
             yield from self._run_batched(solver, instances, rows, time_limit, seed)
         elif self.n_jobs == 1:
             for row in rows:
-                yield row, solve_row(solver, instances[row], row, time_limit, seed)
+                yield row, _solve_row(solver, instances[row], row, time_limit, seed)
         else:
-            yield from self._run_in_processes([Task.of(solver, instances, row, time_limit, seed) for row in rows])
+            yield from self._run_in_processes([_Task.of(solver, instances, row, time_limit, seed) for row in rows])
 
     def _run_batched(
         self, solver: Solver, instances: Instances, rows: Sequence[int], time_limit: float | None, seed: int
@@ -196,13 +196,13 @@ class Runner:
             failure = Failure.of(error)
         yield from ((row, failure) for row in missing)
 
-    def _run_in_processes(self, tasks: Sequence[Task]) -> Iterator[tuple[int, SolverResult | Failure]]:
-        waiting, suspects = deque(tasks), deque[Task]()
+    def _run_in_processes(self, tasks: Sequence[_Task]) -> Iterator[tuple[int, SolverResult | Failure]]:
+        waiting, suspects = deque(tasks), deque[_Task]()
         suspected: set[int] = set()
-        running: dict[Future[SolverResult | Failure], Task] = {}
+        running: dict[Future[SolverResult | Failure], _Task] = {}
         while waiting or suspects or running:
             # After a process has died, each instance that may have been the cause runs alone.
-            queue, room = (suspects, 1) if suspects else (waiting, self.n_jobs * TASKS_PER_PROCESS)
+            queue, room = (suspects, 1) if suspects else (waiting, self.n_jobs * _TASKS_PER_PROCESS)
             while queue and len(running) < room:
                 task = queue.popleft()
                 running[self._submit(task)] = task
@@ -222,7 +222,7 @@ class Runner:
                     # A solver or result that cannot be pickled.
                     yield task.row, Failure.of(error)
 
-    def _submit(self, task: Task) -> Future[SolverResult | Failure]:
+    def _submit(self, task: _Task) -> Future[SolverResult | Failure]:
         if self._pool is None:
             self._context = _RecordingContext()
             self._pool = ProcessPoolExecutor(self.n_jobs, self._context, _start_worker)

@@ -13,7 +13,7 @@ from sb3_uav.common.files import file_hash
 from sb3_uav.solvers.base import Solver
 
 # Packages whose version may change the schedules of a solver.
-PACKAGES = ("torch", "numpy", "stable-baselines3", "scipy", "numba", "ortools", "pyvrp", "highspy", "gurobipy")
+_PACKAGES = ("torch", "numpy", "stable-baselines3", "scipy", "numba", "ortools", "pyvrp", "highspy", "gurobipy")
 
 
 def describe_solver(solver: Solver) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def describe_machine() -> dict[str, Any]:
     :return: Versions of all packages that take part in an evaluation, and the machine
     """
     versions = {"sb3-uav": sb3_uav.__version__, "python": platform.python_version()}
-    for package in PACKAGES:
+    for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

@@ -75,9 +75,9 @@ class ResultRow:
 
 
 RESULT_COLUMNS = tuple(field.name for field in fields(ResultRow))
-WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size"}
-NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
-OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound"}
+_WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size"}
+_NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
+_OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound"}
 
 
 def one_line(text: object) -> str:
@@ -134,11 +134,11 @@ def _parse_row(cells: Sequence[str]) -> ResultRow:
     if len(cells) != len(RESULT_COLUMNS):
         raise ValueError(f"{len(cells)} cells instead of {len(RESULT_COLUMNS)}")
     values: dict[str, Any] = dict(zip(RESULT_COLUMNS, cells, strict=True))
-    for name in WHOLE_NUMBERS | NUMBERS:
-        if values[name] == "" and name in OPTIONAL:
+    for name in _WHOLE_NUMBERS | _NUMBERS:
+        if values[name] == "" and name in _OPTIONAL:
             values[name] = None
         else:
-            values[name] = int(values[name]) if name in WHOLE_NUMBERS else float(values[name])
+            values[name] = int(values[name]) if name in _WHOLE_NUMBERS else float(values[name])
     if values["feasible"] not in ("True", "False") or values["status"] not in (OK, INFEASIBLE, FAILED):
         raise ValueError(f"feasible is {values['feasible']!r} and status is {values['status']!r}")
     values["feasible"] = values["feasible"] == "True"

@@ -17,7 +17,7 @@ from sb3_uav.evaluation.results import FAILED, INFEASIBLE, ResultRow
 
 SUMMARY_CSV, SUMMARY_JSON = "summary.csv", "summary.json"
 # Solvers prove bounds up to rounding errors.
-BOUND_TOLERANCE = 1e-6
+_BOUND_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class SummaryRow:
     :param ratio: Mean objective divided by that of the reference, on the same instances
     :param n_bounds: For how many instances the solver proved a bound
     :param bound: Mean of these bounds
-    :param optimality_gap: See :func:`optimality_gap`, in percent, with the best bounds of all solvers
+    :param optimality_gap: See :func:`_optimality_gap`, in percent, with the best bounds of all solvers
     :param seconds: Mean wall time per instance
     :param batch_size: How many instances were solved at once (the largest batch)
     :param violations: Infeasible schedules and wrong bounds, one line each
@@ -71,7 +71,7 @@ class SummaryRow:
     failures: tuple[str, ...] = ()
 
 
-SUMMARY_COLUMNS = tuple(field.name for field in fields(SummaryRow) if field.name not in ("violations", "failures"))
+_SUMMARY_COLUMNS = tuple(field.name for field in fields(SummaryRow) if field.name not in ("violations", "failures"))
 
 
 def gaps(objectives: Sequence[float]) -> list[float]:
@@ -88,7 +88,7 @@ def gaps(objectives: Sequence[float]) -> list[float]:
     return [objective if math.isnan(objective) else 100 * (best - objective) / (best or 1.0) for objective in objectives]
 
 
-def optimality_gap(objectives: np.ndarray, bounds: np.ndarray) -> float:
+def _optimality_gap(objectives: np.ndarray, bounds: np.ndarray) -> float:
     """
     How far objectives may be from the optimum: the mean of ``(bound - objective) / bound`` over the instances that have both.
 
@@ -146,7 +146,7 @@ def summarize(
                 ratio=_mean(objectives[solver][paired]) / reference_objective if reference_objective > 0 else math.nan,
                 n_bounds=int((~np.isnan(bounds[solver])).sum()),
                 bound=_mean(bounds[solver][~np.isnan(bounds[solver])]),
-                optimality_gap=optimality_gap(objectives[solver], best_bounds),
+                optimality_gap=_optimality_gap(objectives[solver], best_bounds),
                 seconds=_mean(seconds[~np.isnan(seconds)]),
                 batch_size=max(row.batch_size or 0 for row in rows),
                 violations=(*_violations(rows), *_wrong_bounds(rows, best_found)),
@@ -184,7 +184,7 @@ def _wrong_bounds(rows: Sequence[ResultRow], best_found: np.ndarray) -> list[str
         f"{row.solver}, instance {row.instance - rows[0].instance} of {row.source}: its upper bound of {row.bound:g} is below "
         f"{best:g}, which a feasible schedule achieves."
         for row, best in zip(rows, best_found, strict=True)
-        if row.bound is not None and best > row.bound + BOUND_TOLERANCE * max(1.0, abs(row.bound))
+        if row.bound is not None and best > row.bound + _BOUND_TOLERANCE * max(1.0, abs(row.bound))
     ]
 
 
@@ -216,7 +216,7 @@ def write_summary(summary: Sequence[SummaryRow], folder: Path, about: Mapping[st
         for row in summary
     ]
     with replaced_when_complete(folder / SUMMARY_CSV) as file:
-        write_csv(file, SUMMARY_COLUMNS, ([row[column] for column in SUMMARY_COLUMNS] for row in rows))
+        write_csv(file, _SUMMARY_COLUMNS, ([row[column] for column in _SUMMARY_COLUMNS] for row in rows))
     with replaced_when_complete(folder / SUMMARY_JSON) as file:
         json.dump({**about, "confidence": CONFIDENCE, "rows": rows}, file, indent=2, allow_nan=False)
         file.write("\n")

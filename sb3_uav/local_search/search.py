@@ -17,20 +17,20 @@ from sb3_uav.local_search import kernels
 from sb3_uav.local_search.kernels import AnnealingSettings, Plan
 
 # Length of the lists of nearest tasks.
-N_NEAR = 64
+_N_NEAR = 64
 # Number of neighbors that local search joins a task to, and beside which it looks for an insertion.
-N_NEAR_JOINED, N_NEAR_INSERTED = 10, 16
+_N_NEAR_JOINED, _N_NEAR_INSERTED = 10, 16
 # Local search removes strings of at most this many tasks.
-MAX_STRING = 3
+_MAX_STRING = 3
 # Kernels use values rounded to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are
 # far above the threshold for rounding errors of lengths.
-VALUE_BITS = 36
+_VALUE_BITS = 36
 # Ruin and recreate returns to Python about this often, in seconds, to look at the clock.
-CHUNK_SECONDS = 0.02
+_CHUNK_SECONDS = 0.02
 # The repair after it ends at the latest so many seconds after the given time.
-LAST_REPAIR_SECONDS = 1.0
+_LAST_REPAIR_SECONDS = 1.0
 # Trials per task where no time is given.
-TRIALS_PER_TASK = 100
+_TRIALS_PER_TASK = 100
 
 
 class LocalSearch:
@@ -56,12 +56,12 @@ class LocalSearch:
         # In whole multiples of a power of two, so that kernels add them up without rounding errors: else a search that takes
         # such an error for a gain never ends. At most 1, so that sums neither vanish nor overflow.
         values = values[self._tasks]
-        scaled = np.ldexp(values, VALUE_BITS - np.frexp(values.max(initial=0.0))[1])
-        self._nodes["value"][1:] = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -VALUE_BITS)
+        scaled = np.ldexp(values, _VALUE_BITS - np.frexp(values.max(initial=0.0))[1])
+        self._nodes["value"][1:] = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -_VALUE_BITS)
         self._node_of_task = np.zeros(instance.n_tasks, np.int64)
         self._node_of_task[self._tasks] = np.arange(1, len(self._tasks) + 1)
         self._limit = 1.0 + USABLE_TOLERANCE
-        self._near = np.zeros((len(self._nodes), max(min(N_NEAR, len(self._tasks) - 1), 0)), np.int32)
+        self._near = np.zeros((len(self._nodes), max(min(_N_NEAR, len(self._tasks) - 1), 0)), np.int32)
         kernels.find_near(self._nodes, self._near)
 
     def _load(self, schedule: Schedule, seed: int = 0) -> Plan:
@@ -112,12 +112,12 @@ class LocalSearch:
         new, old = self.report(found), self.report(given)
         return found if (new.objective, -new.length) >= (old.objective, -old.length) else given
 
-    def repair(self, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
+    def repair(self, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
         """See :func:`repair`."""
         end = time.perf_counter() + (np.inf if seconds is None else seconds)
         self.report(schedule)
         plan = self._load(schedule)
-        while time.perf_counter() < end and kernels.descend(plan, N_NEAR_JOINED, N_NEAR_INSERTED, max_string):
+        while time.perf_counter() < end and kernels.descend(plan, _N_NEAR_JOINED, _N_NEAR_INSERTED, max_string):
             pass
         return self.better(self._unload(plan), schedule)
 
@@ -137,13 +137,13 @@ class LocalSearch:
         best = self._load(schedule)
         if len(self._tasks) > 0:
             if seconds is None:
-                n_trials = TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
+                n_trials = _TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
                 kernels.anneal(plan, best, n_trials, 0.0, 1.0, settings)
             else:
                 self._anneal(plan, best, start, seconds, settings)
         kernels.measure_all(best)
-        end = start + (np.inf if seconds is None else seconds + LAST_REPAIR_SECONDS)
-        while time.perf_counter() < end and kernels.descend(best, N_NEAR_JOINED, N_NEAR_INSERTED, MAX_STRING):
+        end = start + (np.inf if seconds is None else seconds + _LAST_REPAIR_SECONDS)
+        while time.perf_counter() < end and kernels.descend(best, _N_NEAR_JOINED, _N_NEAR_INSERTED, _MAX_STRING):
             pass
         return self.better(self._unload(best), schedule)
 
@@ -162,10 +162,10 @@ class LocalSearch:
         now = time.perf_counter()
         while now < start + seconds:
             progress = (now - start) / seconds
-            chunk = min(CHUNK_SECONDS, start + seconds - now)
+            chunk = min(_CHUNK_SECONDS, start + seconds - now)
             kernels.anneal(plan, best, n_trials, progress, min(progress + chunk / seconds, 1.0), settings)
             then, now = now, time.perf_counter()
-            n_trials = max(1, int(n_trials * min(CHUNK_SECONDS / max(now - then, 1e-9), 4.0)))
+            n_trials = max(1, int(n_trials * min(_CHUNK_SECONDS / max(now - then, 1e-9), 4.0)))
 
 
 def warm_up() -> None:
@@ -177,7 +177,7 @@ def warm_up() -> None:
     search.repair(search.improve(Schedule([])))
 
 
-def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = MAX_STRING) -> Schedule:
+def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
     """
     Local search until nothing changes.
 

@@ -17,12 +17,12 @@ from sb3_uav.evaluation.results import OK, RESULTS_FILE, ResultRow, read_results
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import DASHED, MARKERS, SERIES_COLORS, style_axes
 
-PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
+_PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
 _LEGEND_WIDTH = 34
 _FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
 
 
-class Curve(NamedTuple):
+class _Curve(NamedTuple):
     """
     The results of one solver on one set of instances.
 
@@ -40,7 +40,7 @@ class Curve(NamedTuple):
     batch_size: int
 
 
-class Panel(NamedTuple):
+class _Panel(NamedTuple):
     """
     :param source: Name of the set of instances
     :param n_instances: Number of instances
@@ -50,7 +50,7 @@ class Panel(NamedTuple):
 
     source: str
     n_instances: int
-    curves: list[Curve]
+    curves: list[_Curve]
     left_out: list[str]
 
 
@@ -84,11 +84,11 @@ def plot_anytime(
     for solver in solvers or ():
         if solver not in known:
             raise ValueError(f"{file}: has no results of {solver!r}; choose some of {known}.")
-    panels = anytime_panels([row for row in rows if solvers is None or row.solver in solvers])
+    panels = _anytime_panels([row for row in rows if solvers is None or row.solver in solvers])
     if not any(panel.curves for panel in panels):
         raise ValueError(f"{file}: no solver has solved all instances of a set; there is nothing to draw.")
     numbers = {solver: number for number, solver in enumerate(known)}
-    figure = new_figure(PANEL_WIDTH, PANEL_HEIGHT * len(panels))
+    figure = new_figure(_PANEL_WIDTH, PANEL_HEIGHT * len(panels))
     for axes, panel in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
         _draw_panel(axes, panel, numbers)
     figure.supxlabel(_FOOTNOTE, fontsize=7.5, color="0.4")
@@ -97,7 +97,7 @@ def plot_anytime(
     return checked
 
 
-def anytime_panels(rows: Sequence[ResultRow]) -> list[Panel]:
+def _anytime_panels(rows: Sequence[ResultRow]) -> list[_Panel]:
     """
     :param rows: Results of an evaluation
     :return: What to draw, in the order of the results
@@ -105,7 +105,7 @@ def anytime_panels(rows: Sequence[ResultRow]) -> list[Panel]:
     return [_panel([row for row in rows if row.source == source]) for source in _unique(row.source for row in rows)]
 
 
-def _panel(rows: Sequence[ResultRow]) -> Panel:
+def _panel(rows: Sequence[ResultRow]) -> _Panel:
     """
     :param rows: Results of one set of instances
     :return: Its panel
@@ -132,8 +132,8 @@ def _panel(rows: Sequence[ResultRow]) -> Panel:
         )
         seconds, objective, halfwidth = np.array(points).T
         batch_size = max(row.batch_size or 1 for key in keys for row in runs[key])
-        curves.append(Curve(solver, seconds, objective, halfwidth, batch_size))
-    return Panel(rows[0].source, len(instances), curves, left_out)
+        curves.append(_Curve(solver, seconds, objective, halfwidth, batch_size))
+    return _Panel(rows[0].source, len(instances), curves, left_out)
 
 
 def _per_instance(rows: Sequence[ResultRow], instances: Sequence[int]) -> np.ndarray:
@@ -154,7 +154,7 @@ def _unique(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def solver_style(number: int) -> dict[str, str]:
+def _solver_style(number: int) -> dict[str, str]:
     """
     :param number: Number of a solver
     :return: Its color and marker; solvers after the eighth reuse the colors with other markers
@@ -163,7 +163,7 @@ def solver_style(number: int) -> dict[str, str]:
     return {"color": SERIES_COLORS[number % n_colors], "marker": MARKERS[(number + number // n_colors) % len(MARKERS)]}
 
 
-def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
+def _draw_panel(axes: Any, panel: _Panel, numbers: dict[str, int]) -> None:
     """
     :param axes: matplotlib axes
     :param panel: What to draw
@@ -183,7 +183,7 @@ def _draw_panel(axes: Any, panel: Panel, numbers: dict[str, int]) -> None:
     axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda seconds, _: f"{seconds:g}"))
     # The legend lists the best solver first, as in the panel.
     for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
-        look = solver_style(numbers[curve.solver])
+        look = _solver_style(numbers[curve.solver])
         name = textwrap.fill(curve.solver.replace(",", ", "), _LEGEND_WIDTH, break_on_hyphens=False)
         label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
         low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import LINE_STYLES, SERIES_COLORS, style_axes
 
-PANEL_WIDTH, PANEL_HEIGHT = 5.2, 3.6
+_PANEL_WIDTH, PANEL_HEIGHT = 5.2, 3.6
 
 
 class Band(NamedTuple):
@@ -55,7 +55,7 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
     names = list(dict.fromkeys(name for line in lines for panel in line for name in panel.bands))
     if not names:
         raise ValueError("There is nothing to draw: give at least one curve.")
-    figure = new_figure(PANEL_WIDTH * max(len(line) for line in lines), PANEL_HEIGHT * len(lines) + 0.4)
+    figure = new_figure(_PANEL_WIDTH * max(len(line) for line in lines), PANEL_HEIGHT * len(lines) + 0.4)
     grid = figure.subplots(len(lines), max(len(line) for line in lines), squeeze=False)
     for line, row in zip(lines, grid, strict=True):
         for panel, axes in zip(line, row, strict=False):
@@ -68,7 +68,7 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
                 axes.plot(band.x, band.mean, color=color, linestyle=style, linewidth=1.6, label=name)
                 low, high = band.mean - band.half_width, band.mean + band.half_width
                 axes.fill_between(band.x, low, high, color=color, alpha=0.2, linewidth=0)
-            axes.set_ylim(visible_range(panel.bands.values()))
+            axes.set_ylim(_visible_range(panel.bands.values()))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             style_axes(axes, "", panel.x_label, panel.y_label, "both")
     handles, labels = grid[0][0].get_legend_handles_labels()
@@ -76,7 +76,7 @@ def plot_bands(lines: Sequence[Sequence[BandPanel]], path: str | os.PathLike[str
     save_figure(figure, path)
 
 
-def visible_range(bands: Collection[Band]) -> tuple[float, float]:
+def _visible_range(bands: Collection[Band]) -> tuple[float, float]:
     """
     Visible range of the vertical axis: all bands, but at most three times the range of the curves, because intervals of two or
     three seeds can be so wide that the curves look flat.

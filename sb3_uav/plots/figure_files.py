@@ -10,18 +10,18 @@ from typing import Any
 from sb3_uav.common.files import temporary_name
 from sb3_uav.envs.render import require_matplotlib
 
-SUFFIXES = (".png", ".pdf", ".svg")
+_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def checked_path(path: str | os.PathLike[str]) -> Path:
     """
     :param path: Output path of a figure
     :return: The path as a ``Path``
-    :raises ValueError: If its suffix is not one of :data:`SUFFIXES`
+    :raises ValueError: If its suffix is not one of :data:`_SUFFIXES`
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: the suffix of a figure must be one of {SUFFIXES}, found {path.suffix!r}.")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"{path}: the suffix of a figure must be one of {_SUFFIXES}, found {path.suffix!r}.")
     return path
 
 

@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import GREEN, MAX_MARKERS, ORANGE, SKY_BLUE, style_axes
 
-LOG_FILE = "its_log.csv"
-LEVELS = ("allocator", "router")
-COLUMNS = {"epoch", "level", "phase", "objective"}
+_LOG_FILE = "its_log.csv"
+_LEVELS = ("allocator", "router")
+_COLUMNS = {"epoch", "level", "phase", "objective"}
 _PHASE_COLORS = {"pre-training": SKY_BLUE, "intensive": ORANGE, "alternate": GREEN}
 _SPELLINGS = {"pretraining": "pre-training"}
 _LINE_COLOR = "#222222"
 
 
-class LoggedEpoch(NamedTuple):
+class _LoggedEpoch(NamedTuple):
     """
     :param epoch: Number of the epoch of its level, from 1
     :param phase: Phase of the strategy
@@ -44,15 +44,15 @@ def plot_learning_curves(its_log: str | os.PathLike[str], path: str | os.PathLik
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
-    epochs = read_its_log(its_log)
+    epochs = _read_its_log(its_log)
     figure = new_figure(8.0, 6.4)
     titles = ("Upper level (allocator), all UAVs", "Lower level (router), per UAV")
-    for axes, level, title in zip(figure.subplots(2, 1), LEVELS, titles, strict=True):
+    for axes, level, title in zip(figure.subplots(2, 1), _LEVELS, titles, strict=True):
         _draw_level(axes, title, epochs[level])
     save_figure(figure, path)
 
 
-def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]]:
+def _read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[_LoggedEpoch]]:
     """
     :param its_log: The ``its_log.csv`` of a run, or the folder of the run
     :return: The epochs of each level, in order; a level may have none
@@ -61,22 +61,22 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
     """
     its_log = Path(its_log)
     if its_log.is_dir():
-        its_log /= LOG_FILE
+        its_log /= _LOG_FILE
     if not its_log.is_file():
         raise FileNotFoundError(f"{its_log}: no such log; give the its_log.csv of a run of the interactive training strategy.")
-    epochs: dict[str, list[LoggedEpoch]] = {level: [] for level in LEVELS}
+    epochs: dict[str, list[_LoggedEpoch]] = {level: [] for level in _LEVELS}
     with its_log.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        missing = COLUMNS - set(reader.fieldnames or ())
+        missing = _COLUMNS - set(reader.fieldnames or ())
         if missing:
             raise ValueError(f"{its_log}: columns {sorted(missing)} are missing; found {reader.fieldnames}.")
         for row in reader:
             where = f"{its_log}, line {reader.line_num}"
             if row["level"] not in epochs:
-                raise ValueError(f"{where}: level is {row['level']!r}, expected one of {LEVELS}.")
+                raise ValueError(f"{where}: level is {row['level']!r}, expected one of {_LEVELS}.")
             phase = _SPELLINGS.get(row["phase"], row["phase"])
             try:
-                epochs[row["level"]].append(LoggedEpoch(int(row["epoch"]), phase, float(row["objective"])))
+                epochs[row["level"]].append(_LoggedEpoch(int(row["epoch"]), phase, float(row["objective"])))
             except (TypeError, ValueError) as error:
                 found = f"{row['epoch']!r} and {row['objective']!r}"
                 raise ValueError(f"{where}: epoch and objective must be numbers, found {found}.") from error
@@ -85,7 +85,7 @@ def read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[LoggedEpoch]
     return {level: sorted(rows) for level, rows in epochs.items()}
 
 
-def _draw_level(axes: Any, title: str, epochs: Sequence[LoggedEpoch]) -> None:
+def _draw_level(axes: Any, title: str, epochs: Sequence[_LoggedEpoch]) -> None:
     """
     :param axes: matplotlib axes
     :param title: Title of the panel

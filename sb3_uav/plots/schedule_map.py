@@ -12,9 +12,9 @@ from sb3_uav.envs.render import draw_map, legend_lines
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 
-PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
+_PANEL_WIDTH, PANEL_HEIGHT = 4.8, 5.0
 _LEGEND_LINE_HEIGHT = 0.2
-MAX_COLUMNS = 4
+_MAX_COLUMNS = 4
 
 
 class MapPanel(NamedTuple):
@@ -50,7 +50,7 @@ def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str 
 
 def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> None:
     """
-    Draw several schedules side by side, :data:`MAX_COLUMNS` in a row.
+    Draw several schedules side by side, :data:`_MAX_COLUMNS` in a row.
 
     :param panels: What to draw
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
@@ -61,7 +61,7 @@ def plot_schedules(panels: Sequence[MapPanel], path: str | os.PathLike[str]) -> 
     save_figure(schedules_figure(panels), path)
 
 
-def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -> Any:
+def schedules_figure(panels: Sequence[MapPanel], n_columns: int = _MAX_COLUMNS) -> Any:
     """
     :param panels: What to draw
     :param n_columns: Number of panels in a row
@@ -74,7 +74,7 @@ def schedules_figure(panels: Sequence[MapPanel], n_columns: int = MAX_COLUMNS) -
     n_columns = min(len(panels), n_columns)
     n_lines = math.ceil(len(panels) / n_columns)
     height = PANEL_HEIGHT + _LEGEND_LINE_HEIGHT * max(legend_lines(panel.schedule.routes) for panel in panels)
-    figure = new_figure(PANEL_WIDTH * n_columns, height * n_lines)
+    figure = new_figure(_PANEL_WIDTH * n_columns, height * n_lines)
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
     for axes, panel in zip(grid, panels, strict=False):
         draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)

@@ -8,7 +8,7 @@ from sb3_uav.envs.render import UAV_COLORS
 
 # Okabe and Ito's palette, readable with color-vision deficiencies; the same as on maps.
 SERIES_COLORS = UAV_COLORS
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY_BLUE = SERIES_COLORS[:6]
+_BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY_BLUE = SERIES_COLORS[:6]
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 LINE_STYLES = ("-", "--", ":", "-.")
 DASHED = (0, (4, 3))

@@ -24,10 +24,10 @@ from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
 
 # Hidden size of the scorer.
-SCORER_DIM = 64
+_SCORER_DIM = 64
 # Weights of the scorer before training: an untrained allocator assigns a task to the UAV that has its neighbors until that UAV
 # has about its share of the tasks. Decoded greedily, this is about as good as a trained allocator.
-INITIAL_SCORE = {
+_INITIAL_SCORE = {
     # Beyond 95 % of its share, every further percent makes a UAV e^0.6 times less likely: with 50 tasks per UAV, one task over
     # the share outweighs all votes.
     FleetFeature.OVERLOAD: -60.0,
@@ -63,7 +63,7 @@ class AllocatorState(NamedTuple):
     features: th.Tensor | None
 
 
-class SharedScorer(nn.Module):
+class _SharedScorer(nn.Module):
     """
     Scores how well a task fits a UAV, with the same parameters for every UAV.
 
@@ -73,18 +73,18 @@ class SharedScorer(nn.Module):
 
     def __init__(self, embed_dim: int, geometry: bool) -> None:
         super().__init__()
-        self.project_task = nn.Linear(embed_dim, SCORER_DIM)
-        self.project_uav = nn.Linear(embed_dim, SCORER_DIM, bias=False)
-        self.project_fleet = nn.Linear(embed_dim, SCORER_DIM, bias=False)
-        self.project_features = nn.Linear(len(FleetFeature), SCORER_DIM, bias=False) if geometry else None
-        self.hidden = nn.Sequential(nn.ReLU(), nn.Linear(SCORER_DIM, SCORER_DIM), nn.ReLU())
-        self.score = nn.Linear(SCORER_DIM, 1)
+        self.project_task = nn.Linear(embed_dim, _SCORER_DIM)
+        self.project_uav = nn.Linear(embed_dim, _SCORER_DIM, bias=False)
+        self.project_fleet = nn.Linear(embed_dim, _SCORER_DIM, bias=False)
+        self.project_features = nn.Linear(len(FleetFeature), _SCORER_DIM, bias=False) if geometry else None
+        self.hidden = nn.Sequential(nn.ReLU(), nn.Linear(_SCORER_DIM, _SCORER_DIM), nn.ReLU())
+        self.score = nn.Linear(_SCORER_DIM, 1)
         self.direct = nn.Linear(len(FleetFeature), 1, bias=False) if geometry else None
         if self.direct is not None:
             for parameter in (*self.direct.parameters(), *self.score.parameters()):
                 nn.init.zeros_(parameter)
             with th.no_grad():
-                for feature, weight in INITIAL_SCORE.items():
+                for feature, weight in _INITIAL_SCORE.items():
                     self.direct.weight[0, feature] = weight
 
     def forward(self, context: th.Tensor, task: th.Tensor, features: th.Tensor | None) -> th.Tensor:
@@ -126,7 +126,7 @@ class AllocatorExtractor(EpisodicExtractor):
         self.n_uavs = None if network.shared_scorer else n_uavs
         if network.shared_scorer:
             self.context_dim = embed_dim
-            self.scorer = SharedScorer(embed_dim, network.geometry)
+            self.scorer = _SharedScorer(embed_dim, network.geometry)
         else:
             self.project_context = nn.Linear(n_uavs * embed_dim, embed_dim)
             self.feed_forward = feed_forward(embed_dim, network.ff_dim)
@@ -149,9 +149,9 @@ class AllocatorExtractor(EpisodicExtractor):
         if assignment.shape[1] > 1 and (assignment == final.where(decided, UNASSIGNED)).all():
             # Steps of one episode share one running maximum.
             mine = final[..., None] == uavs
-            context = at_steps(self.running_context(cache, mine), current_task)
+            context = _at_steps(self.running_context(cache, mine), current_task)
             if geometry is not None:
-                fleet = FleetState(*(at_steps(field, current_task) for field in geometry.of_prefixes(mine)))
+                fleet = FleetState(*(_at_steps(field, current_task) for field in geometry.of_prefixes(mine)))
         else:
             mine = assignment[..., None] == uavs
             # The depot belongs to every UAV and bounds the maximum from below, so it can stand in for other UAVs' tasks.
@@ -188,13 +188,13 @@ class AllocatorExtractor(EpisodicExtractor):
         node = (state.task + 1)[..., None]
         task_embedding = cache.nodes.gather(1, node.expand(-1, -1, cache.nodes.shape[-1]))
         if cache.scorer_nodes is not None:
-            task = cache.scorer_nodes.gather(1, node.expand(-1, -1, SCORER_DIM))
+            task = cache.scorer_nodes.gather(1, node.expand(-1, -1, _SCORER_DIM))
             return th.cat([self.scorer(state.context, task, state.features), task_embedding], dim=-1)
         subset_embedding = self.feed_forward(self.project_context(state.context.flatten(2)))
         return th.cat([subset_embedding, task_embedding], dim=-1)
 
 
-def at_steps(running: th.Tensor, steps: th.Tensor) -> th.Tensor:
+def _at_steps(running: th.Tensor, steps: th.Tensor) -> th.Tensor:
     """
     :param running: ``(batch, 1, n_steps, ...)``, a quantity at every step of an episode
     :param steps: ``(batch, n_samples)`` int64

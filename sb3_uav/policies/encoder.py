@@ -14,14 +14,14 @@ from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import is_recorded
 
 # The strongest preference for near nodes that a head starts with: e^-1 at 1/16 of the maximum flight distance.
-LOCALITY = 256.0
+_LOCALITY = 256.0
 # Keeps the division by the standard deviation finite; the value of torch's own normalizations.
-NORM_EPSILON = 1e-5
+_NORM_EPSILON = 1e-5
 # Logarithm of about 55: the number of tasks whose feature is 0, in the middle of the sizes in use.
-TYPICAL_LOG_TASKS = 4.0
+_TYPICAL_LOG_TASKS = 4.0
 
 
-class InstanceNorm(nn.Module):
+class _InstanceNorm(nn.Module):
     """
     Normalization of every feature over the real nodes of an instance, with learned scale and shift.
 
@@ -50,10 +50,10 @@ class InstanceNorm(nn.Module):
             count = real.sum(1, keepdim=True)
             centred = nodes - nodes.masked_fill(~real, 0.0).sum(1, keepdim=True) / count
             variance = (centred**2).masked_fill(~real, 0.0).sum(1, keepdim=True) / count
-        return centred * ((variance + NORM_EPSILON).rsqrt() * self.weight) + self.bias
+        return centred * ((variance + _NORM_EPSILON).rsqrt() * self.weight) + self.bias
 
 
-class NodeNorm(nn.Module):
+class _NodeNorm(nn.Module):
     """
     Normalization of node embeddings that leaves padded nodes out.
 
@@ -69,7 +69,7 @@ class NodeNorm(nn.Module):
         super().__init__()
         self.norm: nn.Module = nn.Identity()
         if kind == "instance":
-            self.norm = InstanceNorm(embed_dim)
+            self.norm = _InstanceNorm(embed_dim)
         elif kind == "batch":
             self.norm = nn.BatchNorm1d(embed_dim)
         elif kind == "layer":
@@ -81,7 +81,7 @@ class NodeNorm(nn.Module):
         :param node_mask: ``(batch, n_nodes)`` bool, or None when all are real
         :return: ``(batch, n_nodes, embed_dim)``
         """
-        if isinstance(self.norm, InstanceNorm):
+        if isinstance(self.norm, _InstanceNorm):
             return self.norm(nodes, node_mask)
         if not isinstance(self.norm, nn.BatchNorm1d):
             return self.norm(nodes)
@@ -104,7 +104,7 @@ class SelfAttention(nn.Module):
         super().__init__()
         self.n_heads = n_heads
         # From heads that attend to all nodes alike to heads that attend to near ones.
-        slopes = LOCALITY ** th.linspace(0.0, 1.0, n_heads)
+        slopes = _LOCALITY ** th.linspace(0.0, 1.0, n_heads)
         self.log_locality = nn.Parameter(slopes.log()) if relative else None
         self.project_in = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.project_out = nn.Linear(embed_dim, embed_dim, bias=False)
@@ -131,11 +131,11 @@ class SelfAttention(nn.Module):
         squares = (places**2).sum(-1, keepdim=True)
         key = th.cat([key, th.cat([places, squares, zero], dim=-1).expand(shape)], dim=-1)
         value = functional.pad(value, (0, 4))
-        mixed = fused_attention(query, key, value, attention_bias, 1.0)
+        mixed = _fused_attention(query, key, value, attention_bias, 1.0)
         return self.project_out(mixed[..., :head_dim].transpose(1, 2).flatten(2))
 
 
-def fused_attention(
+def _fused_attention(
     query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor | None, scale: float | None = None
 ) -> th.Tensor:
     """
@@ -171,7 +171,7 @@ def attend(query: th.Tensor, key: th.Tensor, value: th.Tensor, n_heads: int, att
     :return: ``(batch, n_queries, embed_dim)``
     """
     query, key, value = (part.unflatten(-1, (n_heads, -1)).transpose(1, 2) for part in (query, key, value))
-    return fused_attention(query, key, value, attention_bias).transpose(1, 2).flatten(2)
+    return _fused_attention(query, key, value, attention_bias).transpose(1, 2).flatten(2)
 
 
 def feed_forward(embed_dim: int, ff_dim: int) -> nn.Sequential:
@@ -183,7 +183,7 @@ def feed_forward(embed_dim: int, ff_dim: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(embed_dim, ff_dim), nn.ReLU(), nn.Linear(ff_dim, embed_dim))
 
 
-class AttentionLayer(nn.Module):
+class _AttentionLayer(nn.Module):
     """
     Self-attention and feed-forward sublayers, each with skip connection and normalization (paper, equations (13) and (14)).
 
@@ -193,9 +193,9 @@ class AttentionLayer(nn.Module):
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
         self.attention = SelfAttention(settings.embed_dim, settings.n_heads, settings.relative)
-        self.attention_norm = NodeNorm(settings.normalization, settings.embed_dim)
+        self.attention_norm = _NodeNorm(settings.normalization, settings.embed_dim)
         self.feed_forward = feed_forward(settings.embed_dim, settings.ff_dim)
-        self.feed_forward_norm = NodeNorm(settings.normalization, settings.embed_dim)
+        self.feed_forward_norm = _NodeNorm(settings.normalization, settings.embed_dim)
 
     def forward(
         self,
@@ -230,7 +230,7 @@ class AttentionEncoder(nn.Module):
         # Relative to itself the depot has no position; what matters is how many tasks there are.
         self.embed_depot = nn.Linear(1 if self.relative else 2, settings.embed_dim)
         self.embed_task = nn.Linear((len(NodeFeature) if self.relative else 2) + self.use_values, settings.embed_dim)
-        self.layers = nn.ModuleList(AttentionLayer(settings) for _ in range(settings.n_layers))
+        self.layers = nn.ModuleList(_AttentionLayer(settings) for _ in range(settings.n_layers))
 
     def forward(self, static: StaticObservation) -> th.Tensor:
         """
@@ -240,7 +240,7 @@ class AttentionEncoder(nn.Module):
         depot, features, coordinates = static.depot, static.tasks, None
         if self.relative:
             coordinates = scaled_coordinates(static)
-            depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - TYPICAL_LOG_TASKS
+            depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - _TYPICAL_LOG_TASKS
             features = node_features(coordinates, static.task_mask)
         if self.use_values:
             features = th.cat([features, static.values[..., None]], dim=-1)

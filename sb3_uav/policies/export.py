@@ -29,7 +29,7 @@ from torch import nn
 
 from sb3_uav.policies.base import EpisodicPolicy
 
-OUTPUTS = ("action", "logits")
+_OUTPUTS = ("action", "logits")
 
 
 class ExportablePolicy(nn.Module):
@@ -44,8 +44,8 @@ class ExportablePolicy(nn.Module):
 
     def __init__(self, policy: EpisodicPolicy, output: str = "action") -> None:
         super().__init__()
-        if output not in OUTPUTS:
-            raise ValueError(f"output is {output!r}; choose one of {OUTPUTS}.")
+        if output not in _OUTPUTS:
+            raise ValueError(f"output is {output!r}; choose one of {_OUTPUTS}.")
         self.policy = policy
         self.output = output
         assert isinstance(policy.observation_space, spaces.Dict)

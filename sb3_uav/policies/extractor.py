@@ -23,7 +23,7 @@ CacheT = TypeVar("CacheT", bound="Cache")
 
 # Transitions are sorted by instance into a table with as many columns as the longest row needs. When that takes more than this
 # many slots per transition, every transition gets a copy of its instance's encoding instead.
-MAX_FILLING = 4
+_MAX_FILLING = 4
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class EpisodicExtractor(BaseFeaturesExtractor):
             return self._decode_each(self._encode_cached(static), dynamic)
         grouping = Grouping.by_instance(index, len(static.depot))
         cache = self.encode(static)
-        if grouping.source.numel() > MAX_FILLING * len(index):
+        if grouping.source.numel() > _MAX_FILLING * len(index):
             return self._decode_each(cache.rows(index), dynamic)
         state = self.observed_state(cache, {key: grouping.gather(value) for key, value in dynamic.items()})
         return grouping.scatter(self.decode(cache, state))

@@ -20,9 +20,9 @@ from sb3_uav.policies.geometry import (
 from sb3_uav.policies.static_observation import StaticObservation
 
 # How many of the nearest earlier tasks count as the neighbors of a task.
-N_NEIGHBORS = 8
+_N_NEIGHBORS = 8
 # Fraction of its share of the tasks from which a UAV counts as full.
-FULL = 0.95
+_FULL = 0.95
 # Logarithm of about 20, a common number of tasks per UAV.
 LOG_TASKS_PER_UAV_OFFSET = 3.0
 
@@ -89,7 +89,7 @@ class FleetGeometry(NamedTuple):
         n_tasks = static.task_mask.shape[1]
         later = th.ones(n_tasks, n_tasks, dtype=th.bool, device=coordinates.device).triu()
         distance = task_distances(coordinates, static.task_mask).masked_fill(later, 2 * FARTHEST)
-        near, neighbors = distance.topk(min(N_NEIGHBORS, n_tasks), largest=False)
+        near, neighbors = distance.topk(min(_N_NEIGHBORS, n_tasks), largest=False)
         return cls(coordinates, neighbors, near, static.task_mask.sum(1, keepdim=True).clamp(min=1).float())
 
     def initial(self, n_samples: int, n_uavs: int) -> FleetState:
@@ -199,7 +199,7 @@ class FleetGeometry(NamedTuple):
         perimeter = fleet.box.sum(-1)
         fields = {
             FleetFeature.LOAD: load,
-            FleetFeature.OVERLOAD: (load - FULL).clamp(min=0.0),
+            FleetFeature.OVERLOAD: (load - _FULL).clamp(min=0.0),
             FleetFeature.EMPTY: empty,
             FleetFeature.VOTES: votes,
             FleetFeature.RELATIVE_DISTANCE: log_ratio(nearest, nearest.amin(-1, keepdim=True)),

@@ -22,7 +22,7 @@ FARTHEST = 1.0
 # Distances below this are as good as 0.
 NEAR = 1e-3
 # How many of the nearest tasks make up the density around a task.
-N_DENSITY = 4
+_N_DENSITY = 4
 # Reachable tasks lie within 0.5 of the depot, 0.25 on average.
 FAR_SCALE = 4
 # Moves between neighbors are shorter: about 0.1.
@@ -96,7 +96,7 @@ def node_features(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
     """
     tasks = coordinates[:, 1:]
     home = th.linalg.vector_norm(tasks, dim=-1, keepdim=True)
-    nearest = smallest(task_distances(coordinates, task_mask), N_DENSITY)
+    nearest = smallest(task_distances(coordinates, task_mask), _N_DENSITY)
     density = th.stack([nearest[..., 0], nearest.mean(-1)], dim=-1).clamp(min=NEAR).log() + LOG_DENSITY_OFFSET
     direction = tasks / home.clamp(min=NEAR)
     home = home.squeeze(-1)

@@ -21,13 +21,13 @@ from sb3_uav.policies.router import RouterPolicy
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
 # A parameter that only one of the policies has.
-SIGNATURES: dict[str, type[EpisodicPolicy]] = {
+_SIGNATURES: dict[str, type[EpisodicPolicy]] = {
     "features_extractor.project_context.weight": AllocatorPolicy,
     "features_extractor.scorer.project_uav.weight": AllocatorPolicy,
     "features_extractor.project_graph.weight": RouterPolicy,
 }
 # Stock A2C adds its optimizer class, which JSON cannot hold, to policy_kwargs; acting needs no optimizer.
-IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
+_IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
 
 
 @overload
@@ -57,7 +57,7 @@ def load_policy(
     """
     file = _existing_file(Path(path))
     data, parameters = _read_zip(file)
-    policy_class = next((cls for key, cls in SIGNATURES.items() if key in parameters), None)
+    policy_class = next((cls for key, cls in _SIGNATURES.items() if key in parameters), None)
     if policy_class is None:
         raise ValueError(
             f"{file}: holds the policy of another kind (its first parameter is {next(iter(parameters), 'missing')!r}); "
@@ -146,7 +146,7 @@ def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
     stored = data.get("policy_kwargs", {})
     if not isinstance(stored, dict):
         raise ValueError(f"{file}: 'policy_kwargs' is {stored!r:.80}, expected a dictionary; save it again with SB3.")
-    policy_kwargs = {key: value for key, value in stored.items() if key not in IGNORED_KWARGS}
+    policy_kwargs = {key: value for key, value in stored.items() if key not in _IGNORED_KWARGS}
     if ":serialized:" in stored:
         # Beside the pickle of a dictionary, SB3 writes its plain items as they are and the others as their repr.
         pickled = sorted(key for key, value in policy_kwargs.items() if isinstance(value, str) and "<" in value)

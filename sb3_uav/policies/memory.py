@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch as th
 
 # Memory of one pass on a CPU, in bytes. More is not faster there.
-CPU_MEMORY = 2**30
+_CPU_MEMORY = 2**30
 # Bytes per node in encoder and decoder: about 1,000 float32 in a default network, four times.
-NODE_MEMORY = 2**14
+_NODE_MEMORY = 2**14
 # Bytes per pair of nodes for the distances between all tasks: differences of coordinates, and copies in float32.
-PAIR_MEMORY = 24
+_PAIR_MEMORY = 24
 # Bytes per task, sample and UAV for splitting: coordinates and indices in float64 and int64, and their copies.
-SPLIT_MEMORY = 48
+_SPLIT_MEMORY = 48
 
 
 def rows_that_fit(device: th.device, n_nodes: int, n_subsets: int = 0) -> int:
@@ -21,9 +21,9 @@ def rows_that_fit(device: th.device, n_nodes: int, n_subsets: int = 0) -> int:
     :param n_subsets: Number of subsets into which each instance is split at once
     :return: Number of instances that can be processed at once, at least 1
     """
-    memory = CPU_MEMORY
+    memory = _CPU_MEMORY
     if device.type == "cuda":
         kept = th.cuda.memory_reserved(device) - th.cuda.memory_allocated(device)
         memory = (th.cuda.mem_get_info(device)[0] + kept) // 4
     # Torch's fused attention does not hold the matrix of scores.
-    return max(memory // (n_nodes * (NODE_MEMORY + SPLIT_MEMORY * n_subsets + PAIR_MEMORY * n_nodes)), 1)
+    return max(memory // (n_nodes * (_NODE_MEMORY + _SPLIT_MEMORY * n_subsets + _PAIR_MEMORY * n_nodes)), 1)

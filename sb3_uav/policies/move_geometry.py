@@ -25,11 +25,11 @@ from sb3_uav.policies.static_observation import StaticObservation
 # How many of the nearest tasks of a node count as what a move leads on to.
 N_NEXT = 16
 # Of them, those whose mean distance and those whose share are features of their own.
-N_CLUSTER, N_FEW = 3, 4
+_N_CLUSTER, _N_FEW = 3, 4
 # Distances to where a move leads on to are capped here, so that "nothing left" is not farther than "far away".
 FARTHEST_NEXT = 0.25
 # The logarithm of the number of feasible tasks is divided by this, that of about 20.
-LOG_COUNT_SCALE = 3
+_LOG_COUNT_SCALE = 3
 
 
 # Features of a move in the router. The weights in existing zips depend on this order.
@@ -101,10 +101,10 @@ class MoveGeometry(NamedTuple):
         there = self.neighbor_home[:, None]
         is_near = (near < FARTHEST) & (near + there <= (left - distance)[..., 1:, None])
         is_open = is_near & action_mask[..., 1:].gather(2, index).view(shape)
-        nearest_open = smallest(th.where(is_open, near, FARTHEST), N_CLUSTER)
+        nearest_open = smallest(th.where(is_open, near, FARTHEST), _N_CLUSTER)
         onward = functional.pad(nearest_open[..., 0], (1, 0), value=FARTHEST)
         cluster = functional.pad(nearest_open.clamp(max=FARTHEST_NEXT).mean(-1), (1, 0), value=FARTHEST_NEXT)
-        few = functional.pad(is_open[..., :N_FEW].sum(-1).to(distance.dtype) / N_FEW, (1, 0))
+        few = functional.pad(is_open[..., :_N_FEW].sum(-1).to(distance.dtype) / _N_FEW, (1, 0))
         many = functional.pad(is_open.sum(-1).to(distance.dtype) / N_NEXT, (1, 0))
 
         feasible = action_mask.clone()
@@ -128,7 +128,7 @@ class MoveGeometry(NamedTuple):
             MoveFeature.CLUSTER: SHORT_SCALE * cluster,
             MoveFeature.OPEN_FEW: few,
             MoveFeature.OPEN_MANY: many,
-            MoveFeature.N_FEASIBLE: (count + 1).log() / LOG_COUNT_SCALE,
+            MoveFeature.N_FEASIBLE: (count + 1).log() / _LOG_COUNT_SCALE,
             MoveFeature.ON_SIDE: on_side,
             MoveFeature.ANGLE: angle.clamp(-1, 1),
         }

@@ -24,12 +24,12 @@ from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import float32_on_cpu
 
 # Compatibilities are clipped to +-10 (C in the paper's equation (22), after Bello et al.).
-LOGIT_CLIP = 10.0
+_LOGIT_CLIP = 10.0
 # What the compatibilities get from the geometry of a move before training: twice as far away is 2^4 times less likely. Tours
 # then begin as those of a randomized nearest neighbor search.
-INITIAL_SCORE = {MoveFeature.RELATIVE_DISTANCE: -4.0}
+_INITIAL_SCORE = {MoveFeature.RELATIVE_DISTANCE: -4.0}
 # Number of chunks, by size, into which subsets are split before they are padded.
-SIZE_CLASSES = 2
+_SIZE_CLASSES = 2
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class RouterState(NamedTuple):
     action_mask: th.Tensor
 
 
-class MoveBias(nn.Module):
+class _MoveBias(nn.Module):
     """
     The share of a move's scores that depends on its geometry, together with the embeddings.
 
-    The last score is that of the compatibilities. It starts as a preference for near tasks, see :data:`INITIAL_SCORE`.
+    The last score is that of the compatibilities. It starts as a preference for near tasks, see :data:`_INITIAL_SCORE`.
 
     :param embed_dim: Size of the embeddings
     :param bias_dim: Hidden size
@@ -89,7 +89,7 @@ class MoveBias(nn.Module):
         for parameter in (*self.linear.parameters(), *self.score.parameters()):
             nn.init.zeros_(parameter)
         with th.no_grad():
-            for feature, weight in INITIAL_SCORE.items():
+            for feature, weight in _INITIAL_SCORE.items():
                 self.linear.weight[-1, feature] = weight
 
     def forward(self, features: th.Tensor, nodes: th.Tensor, query: th.Tensor) -> th.Tensor:
@@ -134,7 +134,7 @@ class RouterExtractor(EpisodicExtractor):
         self.scaled = network.relative or network.geometry
         # One score for each head of the glimpse and one for the compatibilities.
         self.move_bias = (
-            MoveBias(embed_dim, network.bias_dim, n_heads + 1, network.mixed_precision) if network.geometry else None
+            _MoveBias(embed_dim, network.bias_dim, n_heads + 1, network.mixed_precision) if network.geometry else None
         )
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> RouterCache:
@@ -173,7 +173,7 @@ class RouterExtractor(EpisodicExtractor):
         heads = attend(query, cache.glimpse_key, cache.glimpse_value, self.n_heads, attention_bias)
         glimpse = self.project_glimpse(heads)
         compatibility = glimpse @ cache.logit_key.transpose(1, 2) / math.sqrt(self.embed_dim)
-        return th.cat([LOGIT_CLIP * compatibility.tanh() + logit_bias, glimpse], dim=-1)
+        return th.cat([_LOGIT_CLIP * compatibility.tanh() + logit_bias, glimpse], dim=-1)
 
 
 class RouterPolicy(EpisodicPolicy):
@@ -242,7 +242,7 @@ class RouterPolicy(EpisodicPolicy):
         self.set_training_mode(False)
         sizes, order = instances.task_mask.sum(1).clamp(min=1).sort()
         sorted_sizes = sizes.tolist()
-        chunk = min(max_rows or len(order), math.ceil(len(order) / SIZE_CLASSES))
+        chunk = min(max_rows or len(order), math.ceil(len(order) / _SIZE_CLASSES))
         planned = th.full((len(order), instances.n_tasks + 1), DEPOT, device=instances.device)
         start, longest = 0, 1
         while start < len(order):

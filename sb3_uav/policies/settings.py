@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from numbers import Integral
 from typing import Any
 
-NORMALIZATIONS = ("instance", "batch", "layer", "none")
+_NORMALIZATIONS = ("instance", "batch", "layer", "none")
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class NetworkSettings:
     mixed_precision: bool = False
 
     def __post_init__(self) -> None:
-        if self.normalization not in NORMALIZATIONS:
-            raise ValueError(f"normalization is {self.normalization!r}; choose one of {NORMALIZATIONS}.")
+        if self.normalization not in _NORMALIZATIONS:
+            raise ValueError(f"normalization is {self.normalization!r}; choose one of {_NORMALIZATIONS}.")
         for name, least in (("embed_dim", 1), ("n_layers", 0), ("n_heads", 1), ("ff_dim", 1), ("bias_dim", 1)):
             value = getattr(self, name)
             if not isinstance(value, Integral) or value < least:
@@ -60,22 +60,22 @@ class NetworkSettings:
     def of(cls, settings: dict[str, Any], preset: str | None = None) -> NetworkSettings:
         """
         :param settings: Some of the fields; None leaves a field to the preset
-        :param preset: Name of one of :data:`PRESETS`; the defaults of this class when None
+        :param preset: Name of one of :data:`_PRESETS`; the defaults of this class when None
         :return: The settings
         :raises TypeError: If there is no such setting
         :raises ValueError: If there is no such preset, or a value is not allowed
         """
-        if preset is not None and preset not in PRESETS:
-            raise ValueError(f"preset is {preset!r}; choose one of {sorted(PRESETS)}.")
+        if preset is not None and preset not in _PRESETS:
+            raise ValueError(f"preset is {preset!r}; choose one of {sorted(_PRESETS)}.")
         names = [field.name for field in fields(cls)]
         unknown = sorted(settings.keys() - set(names))
         if unknown:
             raise TypeError(f"unexpected keyword arguments {unknown}; the settings of a network are {names}.")
         given = {name: value for name, value in settings.items() if value is not None}
-        return replace(cls() if preset is None else PRESETS[preset], **given)
+        return replace(cls() if preset is None else _PRESETS[preset], **given)
 
 
-PRESETS: dict[str, NetworkSettings] = {
+_PRESETS: dict[str, NetworkSettings] = {
     # One network for every number of tasks and UAVs and every maximum flight distance.
     "default": NetworkSettings(
         embed_dim=64, n_heads=4, ff_dim=256, relative=True, geometry=True, shared_scorer=True, sweep=True

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from sb3_uav.reinforce.baselines import Baseline
 
 # Prevents a division by zero if all advantages are equal, as in SB3.
-EPSILON = 1e-8
+_EPSILON = 1e-8
 
 
 def scale_advantages(advantages: th.Tensor) -> th.Tensor:
@@ -17,7 +17,7 @@ def scale_advantages(advantages: th.Tensor) -> th.Tensor:
     :param advantages: Advantages of any shape
     :return: The advantages divided by their standard deviation; a single advantage is returned unchanged
     """
-    return advantages / (advantages.std() + EPSILON) if advantages.numel() > 1 else advantages
+    return advantages / (advantages.std() + _EPSILON) if advantages.numel() > 1 else advantages
 
 
 def complete_steps(buffer: RolloutBuffer, last_episode_starts: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def step_advantages(buffer: RolloutBuffer, complete: np.ndarray, baseline: Basel
         returns = np.where(complete, buffer.returns, np.nan)
         gain = (returns - baseline.of_steps(returns, buffer.values))[complete]
         if normalize:
-            gain = (gain - gain.mean()) / (gain.std() + EPSILON)
+            gain = (gain - gain.mean()) / (gain.std() + _EPSILON)
         # Scaled so that the mean over the buffer equals the mean over the steps to train on.
         advantages[complete] = gain * (complete.size / complete.sum())
     return advantages

@@ -16,7 +16,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 
 # Number of test instances decoded at once: the smaller of the paper's batch sizes.
-TEST_ROWS = 256
+_TEST_ROWS = 256
 
 
 class Learner(Protocol):
@@ -89,7 +89,7 @@ class Baseline(ABC):
         return
 
 
-class NoBaseline(Baseline):
+class _NoBaseline(Baseline):
     """No baseline: the advantage is the return."""
 
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
@@ -99,7 +99,7 @@ class NoBaseline(Baseline):
         return np.zeros((1, 1))
 
 
-class ExponentialBaseline(Baseline):
+class _ExponentialBaseline(Baseline):
     """
     Exponential moving average of the mean return, including the current batch (Kool et al., appendix).
 
@@ -127,7 +127,7 @@ class ExponentialBaseline(Baseline):
         return np.full((1, 1), self._update(float(np.nanmean(returns))))
 
 
-class SharedBaseline(Baseline):
+class _SharedBaseline(Baseline):
     """The mean return of the ``n_samples`` episodes of the same instance."""
 
     needs_episodes = True
@@ -136,7 +136,7 @@ class SharedBaseline(Baseline):
         return returns.mean(1, keepdim=True)
 
 
-class CriticBaseline(Baseline):
+class _CriticBaseline(Baseline):
     """The policy's value network, trained with the policy and subtracted from the rewards to go at each step."""
 
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
@@ -146,7 +146,7 @@ class CriticBaseline(Baseline):
         return values
 
 
-class RolloutBaseline(Baseline):
+class _RolloutBaseline(Baseline):
     """
     Greedy episodes of a copy of the policy (paper, section IV-C; Kool et al.).
 
@@ -176,7 +176,7 @@ class RolloutBaseline(Baseline):
             raise ValueError(f"n_test_instances is {n_test_instances}; a paired t-test needs at least 2.")
         if not 0 < alpha < 1:
             raise ValueError(f"alpha is {alpha}; a significance level lies between 0 and 1.")
-        self.warmup = ExponentialBaseline(model, beta)
+        self.warmup = _ExponentialBaseline(model, beta)
         self.warmup_epochs = warmup_epochs
         self.n_test_instances = n_test_instances
         self.alpha = alpha
@@ -185,7 +185,7 @@ class RolloutBaseline(Baseline):
         if self.model.epoch < self.warmup_epochs:
             return self.warmup.of_episodes(problem, instances, returns)
         assert self.model.baseline_policy is not None
-        return greedy_returns(self.model.baseline_policy, problem, instances)
+        return _greedy_returns(self.model.baseline_policy, problem, instances)
 
     def end_epoch(self, problem: Problem) -> None:
         assert self.model.baseline_policy is not None
@@ -194,9 +194,9 @@ class RolloutBaseline(Baseline):
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
         instances = copy.arrange(instances)
         gains = []
-        for rows in th.arange(len(instances), device=instances.device).split(TEST_ROWS):
+        for rows in th.arange(len(instances), device=instances.device).split(_TEST_ROWS):
             part = instances[rows].to(self.model.device)
-            gains.append((greedy_returns(policy, problem, part) - greedy_returns(copy, problem, part)).cpu())
+            gains.append((_greedy_returns(policy, problem, part) - _greedy_returns(copy, problem, part)).cpu())
         gain = th.cat(gains).flatten().numpy()
         replaced = significantly_positive(gain, self.alpha)
         if replaced:
@@ -205,7 +205,7 @@ class RolloutBaseline(Baseline):
         self.model.logger.record("train/baseline_replaced", int(replaced))
 
 
-def greedy_returns(policy: Any, problem: Problem, instances: Instances) -> th.Tensor:
+def _greedy_returns(policy: Any, problem: Problem, instances: Instances) -> th.Tensor:
     """
     :param policy: An ``EpisodicPolicy``
     :param problem: The problem to play
@@ -220,9 +220,9 @@ def greedy_returns(policy: Any, problem: Problem, instances: Instances) -> th.Te
 
 
 BASELINES: dict[str, type[Baseline]] = {
-    "none": NoBaseline,
-    "exponential": ExponentialBaseline,
-    "shared": SharedBaseline,
-    "critic": CriticBaseline,
-    "rollout": RolloutBaseline,
+    "none": _NoBaseline,
+    "exponential": _ExponentialBaseline,
+    "shared": _SharedBaseline,
+    "critic": _CriticBaseline,
+    "rollout": _RolloutBaseline,
 }

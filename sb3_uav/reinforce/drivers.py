@@ -11,8 +11,8 @@ from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.reinforce.recognition import why_unrecognized
 
 # Settings of REINFORCE that only one of the drivers uses, with their defaults.
-FUSED_SETTINGS: dict[str, Any] = {"n_samples": 1, "instances_per_epoch": 1_280_000, "lr_decay": 1.0}
-STEP_LOOP_SETTINGS: dict[str, Any] = {"n_steps": 512, "gamma": 1.0}
+_FUSED_SETTINGS: dict[str, Any] = {"n_samples": 1, "instances_per_epoch": 1_280_000, "lr_decay": 1.0}
+_STEP_LOOP_SETTINGS: dict[str, Any] = {"n_steps": 512, "gamma": 1.0}
 
 
 def why_step_loop(policy_class: type, env: VecEnv | None) -> str:
@@ -33,7 +33,7 @@ def warn_of_ignored_settings(model: Any) -> None:
     :param model: A REINFORCE algorithm
     """
     fused = model.problem is not None
-    settings = STEP_LOOP_SETTINGS if fused else FUSED_SETTINGS
+    settings = _STEP_LOOP_SETTINGS if fused else _FUSED_SETTINGS
     ignored = [f"{name}={getattr(model, name)!r}" for name, default in settings.items() if getattr(model, name) != default]
     if ignored:
         cause = "it plays whole episodes, undiscounted" if fused else why_step_loop(model.policy_class, model.env)

@@ -9,7 +9,7 @@ from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, strip_wrappers, unwrap_problem_env
 
 # Wrappers that leave observations, actions and rewards as they are.
-TRANSPARENT_VEC_WRAPPERS = (VecMonitor, VecCheckNan)
+_TRANSPARENT_VEC_WRAPPERS = (VecMonitor, VecCheckNan)
 
 
 def find_problem(env: VecEnv) -> Problem | None:
@@ -33,7 +33,7 @@ def why_unrecognized(env: VecEnv) -> str:
 def _recognize(env: VecEnv) -> Problem | str:
     """:return: The problem, or the reason why there is none"""
     inner = env
-    while isinstance(inner, TRANSPARENT_VEC_WRAPPERS):
+    while isinstance(inner, _TRANSPARENT_VEC_WRAPPERS):
         inner = inner.venv
     if isinstance(inner, BatchedVecEnv):
         return inner.problem

@@ -46,7 +46,7 @@ SelfT = TypeVar("SelfT", bound="REINFORCE")
 NO_STEP_LIMIT = 2**62
 # Settings of SB3's on-policy algorithms that REINFORCE does not offer: returns are not mixed with value estimates, and actions
 # are discrete.
-NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
+_NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
 class REINFORCE(OnPolicyAlgorithm):
@@ -130,7 +130,7 @@ class REINFORCE(OnPolicyAlgorithm):
             gamma=gamma,
             ent_coef=ent_coef,
             vf_coef=vf_coef,
-            **NOT_OFFERED,
+            **_NOT_OFFERED,
             max_grad_norm=max_grad_norm,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

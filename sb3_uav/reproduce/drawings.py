@@ -24,7 +24,7 @@ SCHEDULE_COLUMNS = ("Situation", "Point", "x", "y", "Maximum distance", "UAV", "
 CURVE_COLUMNS = ("Training", "Level", "Epoch", "Phase", "Cost", "Minutes")
 
 
-class Curve(NamedTuple):
+class _Curve(NamedTuple):
     """
     :param cost: ``(n_epochs,)``, minus the mean objective of the training episodes
     :param minutes: ``(n_epochs,)``, time since the beginning of the training
@@ -64,17 +64,17 @@ def _draw_schedules(table: Table) -> Any:
     return schedules_figure(panels, _MAPS_PER_LINE)
 
 
-def _read_curves(table: Table) -> dict[str, dict[str, Curve]]:
+def _read_curves(table: Table) -> dict[str, dict[str, _Curve]]:
     """
     :param table: A row for each epoch of each level
     :return: The curves by training and level
     """
-    curves: dict[str, dict[str, Curve]] = {}
+    curves: dict[str, dict[str, _Curve]] = {}
     for training, level in dict.fromkeys((row[0], row[1]) for row in table.rows):
         rows = [row for row in table.rows if row[:2] == [training, level]]
         cost, minutes = (np.array([float(row[column]) for row in rows]) for column in (4, 5))
         n_pretraining = sum(row[3] == "pre-training" for row in rows)
-        curves.setdefault(training, {})[level] = Curve(cost, minutes, n_pretraining)
+        curves.setdefault(training, {})[level] = _Curve(cost, minutes, n_pretraining)
     return curves
 
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from sb3_uav.reproduce.pair_training import PairTraining
 
 # Seconds between two reads of the logs of running trainings.
-POLL_INTERVAL = 1.0
+_POLL_INTERVAL = 1.0
 
 
 class EpochLines:
@@ -39,7 +39,7 @@ class EpochLines:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._over.wait(POLL_INTERVAL):
+        while not self._over.wait(_POLL_INTERVAL):
             self._look()
         self._look()
 
@@ -56,7 +56,7 @@ class EpochLines:
     @staticmethod
     def _lines(job: PairTraining) -> list[str]:
         """The lines of the log of its newest run, without the header."""
-        from sb3_uav.training.epoch_log import LOG_FILE
+        from sb3_uav.common.epoch_log import LOG_FILE
 
         logs = sorted(job.run_folder.glob(f"reinforce/*/{LOG_FILE}"), key=lambda log: log.stat().st_mtime)
         return logs[-1].read_text(encoding="utf-8").splitlines()[1:] if logs else []

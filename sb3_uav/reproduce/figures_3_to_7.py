@@ -33,7 +33,7 @@ from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 _LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
 
 
-class LoggedCurve(NamedTuple):
+class _LoggedCurve(NamedTuple):
     """
     The epochs of one level of one training.
 
@@ -49,7 +49,7 @@ class LoggedCurve(NamedTuple):
     generation_minutes: float
 
 
-def read_logged_curves(its_log: Path) -> dict[str, LoggedCurve]:
+def _read_logged_curves(its_log: Path) -> dict[str, _LoggedCurve]:
     """
     :param its_log: The ``its_log.csv`` of a training, in chronological order
     :return: The curves of both levels
@@ -62,7 +62,7 @@ def read_logged_curves(its_log: Path) -> dict[str, LoggedCurve]:
     for level in LEVELS:
         mine = [index for index, row in enumerate(rows) if row["level"] == level]
         cost = np.array([-float(rows[index]["objective"]) for index in mine])
-        curves[level] = LoggedCurve(cost, [rows[index]["phase"] for index in mine], minutes[mine], generation)
+        curves[level] = _LoggedCurve(cost, [rows[index]["phase"] for index in mine], minutes[mine], generation)
     return curves
 
 
@@ -130,7 +130,7 @@ def fig4(session: Session) -> list[Path]:
     """
     here = [scenario for scenario in scenarios() if scenario.n_tasks in session.scale.trained_sizes]
     models = session.models.get([(scenario, ITS) for scenario in here], log_needed=True)
-    curves = {s: read_logged_curves(log) for s in here if (s, ITS) in models and (log := models[s, ITS].its_log) is not None}
+    curves = {s: _read_logged_curves(log) for s in here if (s, ITS) in models and (log := models[s, ITS].its_log) is not None}
     notes = Notes("Cost: minus the mean number of tasks completed in the training episodes (lower level: by one UAV).")
     notes.add("Until the dotted line, the lower level is pre-trained on whole instances.")
     notes.add_stand_ins(session.scale, [])
@@ -148,7 +148,7 @@ def fig4(session: Session) -> list[Path]:
     return session.write(table, "fig4", _curves_table("Fig. 4", {s.name: c for s, c in curves.items()}, table.notes))
 
 
-def _curves_table(label: str, curves: Mapping[str, Mapping[str, LoggedCurve]], notes: Sequence[str]) -> Table:
+def _curves_table(label: str, curves: Mapping[str, Mapping[str, _LoggedCurve]], notes: Sequence[str]) -> Table:
     table = Table(label, "every epoch", [Column(title) for title in CURVE_COLUMNS], notes=list(notes))
     for name, levels in curves.items():
         for level, curve in levels.items():
@@ -171,7 +171,7 @@ def fig5(session: Session) -> list[Path]:
     scenario = Scenario(ABLATION_FLEET, ABLATION_SIZE)
     models = session.models.get([(scenario, strategy) for strategy in ABLATION_STRATEGIES], log_needed=True)
     curves = {
-        strategy: read_logged_curves(log)
+        strategy: _read_logged_curves(log)
         for strategy in ABLATION_STRATEGIES
         if (scenario, strategy) in models and (log := models[scenario, strategy].its_log) is not None
     }

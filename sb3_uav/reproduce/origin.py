@@ -11,13 +11,13 @@ from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.reproduce.paper import paper_tables
 from sb3_uav.reproduce.scales import Scale
 
-KEYS = ("Command", "Scale", "Seed", "Versions", "Machine", "Figures of the paper")
+_KEYS = ("Command", "Scale", "Seed", "Versions", "Machine", "Figures of the paper")
 
 
 @dataclass(frozen=True)
 class Origin:
     """
-    :param lines: A line for each of :data:`KEYS`
+    :param lines: A line for each of :data:`_KEYS`
     """
 
     lines: tuple[str, ...]
@@ -40,7 +40,7 @@ class Origin:
             f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
             paper_tables()["source"],
         )
-        return cls(tuple(f"{key}: {text}" for key, text in zip(KEYS, texts, strict=True)))
+        return cls(tuple(f"{key}: {text}" for key, text in zip(_KEYS, texts, strict=True)))
 
     @classmethod
     def read(cls, comments: Sequence[str]) -> tuple[Origin, list[str]]:
@@ -49,17 +49,17 @@ class Origin:
         :return: The origin among them, and the others
         :raises ValueError: If they do not begin with the origin
         """
-        lines, others = comments[: len(KEYS)], comments[len(KEYS) :]
-        if [line.partition(": ")[0] for line in lines] != list(KEYS):
-            raise ValueError(f"its comments do not begin with {', '.join(KEYS)}")
+        lines, others = comments[: len(_KEYS)], comments[len(_KEYS) :]
+        if [line.partition(": ")[0] for line in lines] != list(_KEYS):
+            raise ValueError(f"its comments do not begin with {', '.join(_KEYS)}")
         return cls(tuple(lines)), list(others)
 
     def __getitem__(self, key: str) -> str:
         """
-        :param key: One of :data:`KEYS`
+        :param key: One of :data:`_KEYS`
         :return: What its line says
         """
-        return self.lines[KEYS.index(key)].partition(": ")[2]
+        return self.lines[_KEYS.index(key)].partition(": ")[2]
 
     def metadata(self, suffix: str) -> dict[str, str | None]:
         """

@@ -21,9 +21,9 @@ from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
-TRAINING_FILE = "training.json"
+_TRAINING_FILE = "training.json"
 _CONFIG_FILE, _OUTPUT_FILE = "config.yml", "output.txt"
-ITS_KEY = "sb3_uav.training.ITSCallback"
+_ITS_KEY = "sb3_uav.training.ITSCallback"
 
 
 class TrainingError(ValueError):
@@ -65,7 +65,7 @@ class PairTraining:
     @property
     def its(self) -> Mapping[str, Any]:
         """The arguments of the interactive training strategy."""
-        return self.entry["callback"][0][ITS_KEY]
+        return self.entry["callback"][0][_ITS_KEY]
 
     @property
     def schedule(self) -> EpochSchedule:
@@ -98,7 +98,7 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
         raise FileNotFoundError("reinforce.yml: not found; install sb3-uav again.")
     shipped = read_yaml(config)[allocation_id(scenario.n_uavs, scenario.n_tasks)]
     entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
-    its = entry["callback"][0][ITS_KEY]
+    its = entry["callback"][0][_ITS_KEY]
     its |= {**recipe.its, "strategy": strategy, "verbose": 1}
     its["router"] |= recipe.router
     if scenario.n_tasks in recipe.instances_per_epoch:
@@ -174,7 +174,7 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     :param run: The zoo's folder of the run
     :param state: State of its checkpoint
     """
-    from sb3_uav.training.epoch_log import LOG_FILE
+    from sb3_uav.common.epoch_log import LOG_FILE
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER
 
     temporary = job.model_folder.with_name(job.model_folder.name + ".tmp")
@@ -192,7 +192,7 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
         "run": str(run),
         **describe_machine(),
     }
-    (temporary / TRAINING_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    (temporary / _TRAINING_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     os.replace(temporary, job.model_folder)
 
 
@@ -202,7 +202,7 @@ def check_complete(job: PairTraining) -> bool:
     :return: Whether it is complete
     :raises TrainingError: If the existing pair was trained with other settings
     """
-    path = job.model_folder / TRAINING_FILE
+    path = job.model_folder / _TRAINING_FILE
     if not path.is_file():
         return False
     try:
@@ -220,14 +220,14 @@ def check_complete(job: PairTraining) -> bool:
 
 def _same_training(about: Mapping[str, Any], job: PairTraining) -> bool:
     """
-    :param about: What :data:`TRAINING_FILE` says of a trained pair
+    :param about: What :data:`_TRAINING_FILE` says of a trained pair
     :param job: A training
     :return: Whether the pair is its result. Earlier versions used the paper's names of the strategies, and trained the router
         of DL-DRL-I in the epochs of pre-training only
     """
-    its = {**about["entry"]["callback"][0][ITS_KEY]}
+    its = {**about["entry"]["callback"][0][_ITS_KEY]}
     its["strategy"] = strategy_name(its["strategy"])
-    entry = {**about["entry"], "callback": [{ITS_KEY: its}, *about["entry"]["callback"][1:]]}
+    entry = {**about["entry"], "callback": [{_ITS_KEY: its}, *about["entry"]["callback"][1:]]}
     n_router_epochs = job.schedule.n_router_epochs
     earlier = its["n_pretraining_epochs"] if job.strategy == INDEPENDENT else n_router_epochs
     return entry == job.entry and about["seed"] == job.seed and about.get("n_router_epochs", earlier) == n_router_epochs

@@ -21,7 +21,7 @@ from sb3_uav.training.its_schedule import ALTERNATE_ONLY, INDEPENDENT, ITS, NO_I
 
 LEVELS = ("allocator", "router")
 # Folders of the strategies; those of the ablation without what their names say.
-STRATEGY_FOLDERS = {
+_STRATEGY_FOLDERS = {
     ITS: "ITS",
     NO_PRETRAINING: "ITS-without-pre-training",
     NO_INTENSIVE: "ITS-without-intensive",
@@ -29,7 +29,7 @@ STRATEGY_FOLDERS = {
     INDEPENDENT: "independent",
 }
 # Required columns of a log and their types.
-LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
+_LOG_COLUMNS: dict[str, Callable[[str], object]] = {"n_instances": int, "objective": float, "seconds": float}
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def read_log(its_log: Path) -> list[dict[str, str]]:
         raise ValueError(f"{its_log}: is no log of a training ({error}); {remedy}.") from error
     for number, row in enumerate(rows, start=2):
         try:
-            for column, kind in LOG_COLUMNS.items():
+            for column, kind in _LOG_COLUMNS.items():
                 kind(row[column])
             # Earlier versions did not write it.
             float(row.get("generation_seconds") or 0.0)
@@ -98,7 +98,7 @@ class Models:
     :param out: Folder of all results; trained pairs are in ``models`` and, for Table I, in ``timing``
     :param given: The user's own pairs: ``U4-N80/ITS/allocator.zip`` and ``router.zip`` (and the ``its_log.csv`` of their
         training, for Table I and Figs. 4 and 5), or, for all sizes of a fleet, ``U4/ITS/...``, or for everything, ``ITS/...``.
-        :data:`STRATEGY_FOLDERS` are the names in place of ``ITS``
+        :data:`_STRATEGY_FOLDERS` are the names in place of ``ITS``
     :param seed: Seed of the trainings
     :param device: Their device
     :param num_threads: Threads of torch; its own choice when None, one if there are several jobs
@@ -171,7 +171,7 @@ class Models:
         if self.given is None:
             return None
         for part, label in ((scenario.folder, scenario.name), (f"U{scenario.n_uavs}",) * 2, (".", "universal")):
-            model = Model(scenario, strategy, self.given / part / STRATEGY_FOLDERS[strategy], label)
+            model = Model(scenario, strategy, self.given / part / _STRATEGY_FOLDERS[strategy], label)
             if model.allocator.is_file() and model.router.is_file():
                 return model
             if model.allocator.is_file() or model.router.is_file():
@@ -180,7 +180,7 @@ class Models:
         return None
 
     def _job(self, recipe: Recipe, kind: str, scenario: Scenario, strategy: str) -> PairTraining:
-        place = Path(scenario.folder) / STRATEGY_FOLDERS[strategy]
+        place = Path(scenario.folder) / _STRATEGY_FOLDERS[strategy]
         return PairTraining(
             scenario,
             strategy,

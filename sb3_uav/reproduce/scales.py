@@ -110,20 +110,20 @@ def scenarios(sizes: tuple[int, ...] = SIZES) -> list[Scenario]:
 
 
 # The paper's networks, smaller. Its batch normalization needs larger batches than these scales have.
-TINY = {"preset": "paper", "normalization": "instance", "embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16}
-SMALL = {"preset": "paper", "normalization": "instance", "embed_dim": 64, "n_layers": 2, "n_heads": 4, "ff_dim": 128}
+_TINY = {"preset": "paper", "normalization": "instance", "embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16}
+_SMALL = {"preset": "paper", "normalization": "instance", "embed_dim": 64, "n_layers": 2, "n_heads": 4, "ff_dim": 128}
 # Eight samples per instance with their mean as the baseline: no second rollout and far fewer instances.
-SHARED_BASELINE = {"baseline": "shared", "n_samples": 8, "normalize_advantage": True, "learning_rate": 1e-3}
+_SHARED_BASELINE = {"baseline": "shared", "n_samples": 8, "normalize_advantage": True, "learning_rate": 1e-3}
 
-SMOKE = Scale(
+_SMOKE = Scale(
     name="smoke",
     text="a test of the commands, not of the method: tiny networks, a tenth of the tasks, a maximum flight distance of 1",
     shrink=10,
     max_distance=1.0,
     trained_sizes=(80, 200),
     recipe=Recipe(
-        allocator={**SHARED_BASELINE, "policy_kwargs": TINY, "n_envs": 8, "n_samples": 4},
-        router={**SHARED_BASELINE, "policy_kwargs": TINY, "n_envs": 8, "n_samples": 4},
+        allocator={**_SHARED_BASELINE, "policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4},
+        router={**_SHARED_BASELINE, "policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4},
         its={"n_epochs": 4, "n_pretraining_epochs": 1, "n_intensive_epochs": 2, "n_continuous_epochs": 2},
         instances_per_epoch=dict.fromkeys(SIZES, 16),
     ),
@@ -135,13 +135,13 @@ SMOKE = Scale(
     samples=8,
 )
 
-CPU = Scale(
+_CPU = Scale(
     name="cpu",
     text="an afternoon on two CPU cores with two jobs: networks of width 64 with two layers, 24 epochs of 640 instances and "
     "fewer, eight samples per instance with their mean as baseline in place of the greedy rollout",
     recipe=Recipe(
-        allocator={**SHARED_BASELINE, "policy_kwargs": SMALL, "n_envs": 32, "lr_decay": 0.92},
-        router={**SHARED_BASELINE, "policy_kwargs": SMALL, "n_envs": 32, "lr_decay": 0.95},
+        allocator={**_SHARED_BASELINE, "policy_kwargs": _SMALL, "n_envs": 32, "lr_decay": 0.92},
+        router={**_SHARED_BASELINE, "policy_kwargs": _SMALL, "n_envs": 32, "lr_decay": 0.95},
         its={"n_epochs": 24},
         instances_per_epoch={80: 640, 100: 640, 150: 640, 200: 640, 300: 320, 500: 192},
     ),
@@ -162,7 +162,7 @@ CPU = Scale(
     samples=128,
 )
 
-PAPER = Scale(
+_PAPER = Scale(
     name="paper",
     text="the paper's own settings: 100 epochs of 1,280,000 instances for every one of twelve situations; meant for GPUs",
     recipe=Recipe(),
@@ -174,4 +174,4 @@ PAPER = Scale(
     samples=128,
 )
 
-SCALES = {scale.name: scale for scale in (SMOKE, CPU, PAPER)}
+SCALES = {scale.name: scale for scale in (_SMOKE, _CPU, _PAPER)}

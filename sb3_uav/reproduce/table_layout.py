@@ -8,7 +8,7 @@ from itertools import groupby
 from sb3_uav.reproduce.table_formats import MISSING, Table
 
 
-def best(cells: Sequence[str], smallest: bool = False) -> list[int]:
+def _best(cells: Sequence[str], smallest: bool = False) -> list[int]:
     """
     :param cells: Numbers as the table shows them
     :param smallest: Whether the smallest is the best
@@ -37,7 +37,7 @@ def lay_out(table: Table) -> None:
         table.bold = _best_methods(table)
     elif table.label in ("Fig. 6", "Fig. 7"):
         for column in range(1, len(table.columns)):
-            table.bold |= {(row, column) for row in best([cells[column] for cells in table.rows])}
+            table.bold |= {(row, column) for row in _best([cells[column] for cells in table.rows])}
 
 
 def _changes(keys: Iterable[str]) -> list[int]:
@@ -62,7 +62,7 @@ def _best_of_blocks(table: Table) -> set[tuple[int, int]]:
     for position, row in enumerate(table.rows):
         measure = row[1]
         for columns in blocks.values() if measure in ("Obj.", "Gap") else ():
-            found = best([row[column] for column in columns], smallest=measure == "Gap")
+            found = _best([row[column] for column in columns], smallest=measure == "Gap")
             bold.update((position, columns[index]) for index in found)
     return bold
 
@@ -75,6 +75,6 @@ def _best_methods(table: Table) -> set[tuple[int, int]]:
     bold: set[tuple[int, int]] = set()
     for index, column in enumerate(table.columns):
         for positions in parts.values() if column.group else ():
-            found = best([table.rows[position][index] for position in positions], smallest=column.title == "Time(s)")
+            found = _best([table.rows[position][index] for position in positions], smallest=column.title == "Time(s)")
             bold.update((positions[found_index], index) for found_index in found)
     return bold

@@ -36,11 +36,11 @@ from sb3_uav.reproduce.table_formats import Column, Table, number
 from sb3_uav.solvers.base import Solver
 from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
-PAPER, OURS = "paper", "ours"
+_PAPER, _OURS = "paper", "ours"
 _FASTEST_SHOWN = 0.1
 
 
-class PhaseTimes(NamedTuple):
+class _PhaseTimes(NamedTuple):
     """
     Seconds per instance; NaN where the log does not contain them.
 
@@ -56,7 +56,7 @@ class PhaseTimes(NamedTuple):
     n_instances: int
 
 
-def seconds(value: float | None) -> str:
+def _seconds(value: float | None) -> str:
     """
     :param value: A time
     :return: Text for a cell, with more digits for short times
@@ -75,7 +75,7 @@ def table1(session: Session) -> list[Path]:
     :return: Paths of the written files
     """
     models = session.models.timed(scenarios())
-    groups = [Column(source, phase) for phase in PHASES for source in (PAPER, OURS)]
+    groups = [Column(source, phase) for phase in PHASES for source in (_PAPER, _OURS)]
     table = Table("Table I", paper_tables()["table1"]["caption"], [Column("Situation"), *groups])
     notes = Notes(
         f"Minutes per epoch of {INSTANCES_PER_EPOCH:,} instances. The paper's: one RTX 3090, two from 300 tasks on. Ours are "
@@ -92,7 +92,7 @@ def table1(session: Session) -> list[Path]:
     measured: dict[int, list[str]] = {}
     missing: list[str] = []
     for scenario in scenarios():
-        times = phase_times(models[scenario]) if scenario in models else None
+        times = _phase_times(models[scenario]) if scenario in models else None
         if times is None:
             missing.append(scenario.name)
         else:
@@ -113,7 +113,7 @@ def _batch_size(session: Session) -> int:
     return session.scale.timing.allocator["n_envs"]
 
 
-def phase_times(model: Model) -> PhaseTimes:
+def _phase_times(model: Model) -> _PhaseTimes:
     """
     :param model: A trained pair with the log of its training
     :return: Durations of the phases of an epoch
@@ -128,7 +128,7 @@ def phase_times(model: Model) -> PhaseTimes:
     nothing = {"seconds": "nan", "generation_seconds": "nan", "n_instances": "1"}
     # Logs of earlier versions do not separate generation from training.
     generation = _per_instance(lower or [nothing], "generation_seconds")
-    return PhaseTimes(
+    return _PhaseTimes(
         _per_instance(upper or [nothing], "seconds"),
         _per_instance(lower or [nothing], "seconds") - generation,
         generation,
@@ -199,10 +199,10 @@ def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list
             for block, methods in blocks.items()
         }
         for title, measure in MEASURES.items():
-            for source, figures in ((PAPER, papers), (OURS, ours)):
+            for source, figures in ((_PAPER, papers), (_OURS, ours)):
                 cells = [str(scenario.n_tasks), title, source]
                 for block in blocks:
-                    show = seconds if measure == "seconds" and source == OURS else number
+                    show = _seconds if measure == "seconds" and source == _OURS else number
                     cells += [show(value) for value in figures[block][measure]]
                 table.add(cells)
     _say_how_exact(errors, notes)
@@ -347,14 +347,14 @@ def table4(session: Session) -> list[Path]:
         ours = {size: _larger(session, Scenario(n_uavs, size), pairs, notes) for size in LARGER_SIZES}
         errors += [row.standard_error for rows in ours.values() for row in rows.values()]
         found = {
-            OURS: {
+            _OURS: {
                 size: {
                     "objective": [complete(ours[size].get(method), lambda row: row.objective) for method in methods],
                     "seconds": [complete(ours[size].get(method), lambda row: row.seconds) for method in methods],
                 }
                 for size in LARGER_SIZES
             },
-            PAPER: {
+            _PAPER: {
                 size: {
                     measure: [paper_figure("table4", f"U{n_uavs}", str(size), method, measure) for method in methods]
                     for measure in ("objective", "seconds")
@@ -363,14 +363,14 @@ def table4(session: Session) -> list[Path]:
             },
         }
         for position, method in enumerate(methods):
-            for source in (PAPER, OURS):
-                if source == PAPER and method in session.extra_solvers:
+            for source in (_PAPER, _OURS):
+                if source == _PAPER and method in session.extra_solvers:
                     continue
                 cells = [f"U{n_uavs}", method, source]
                 for size in LARGER_SIZES:
                     figures = found[source][size]
                     for measure in ("objective", "seconds"):
-                        show = seconds if measure == "seconds" and source == OURS else number
+                        show = _seconds if measure == "seconds" and source == _OURS else number
                         cells.append(show(figures[measure][position]))
                 table.add(cells)
     _say_how_exact(errors, notes)

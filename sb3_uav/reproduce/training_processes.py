@@ -28,12 +28,12 @@ def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
                 train_pair(job)
         return
     waiting = deque(jobs)
-    running: dict[int, TrainingProcess] = {}
+    running: dict[int, _TrainingProcess] = {}
     try:
         with EpochLines(jobs, f"{len(jobs)} trainings, {n_jobs} at once: ") as lines:
             while waiting or running:
                 while waiting and len(running) < n_jobs:
-                    training = TrainingProcess.start(waiting.popleft())
+                    training = _TrainingProcess.start(waiting.popleft())
                     lines.print(f"{training.job.title}: begins")
                     running[training.process.sentinel] = training
                 for sentinel in connection.wait(list(running)):
@@ -45,7 +45,7 @@ def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
             training.process.join()
 
 
-class TrainingProcess(NamedTuple):
+class _TrainingProcess(NamedTuple):
     """
     A training in a separate process.
 
@@ -59,10 +59,10 @@ class TrainingProcess(NamedTuple):
     errors: connection.Connection
 
     @classmethod
-    def start(cls, job: PairTraining) -> TrainingProcess:
+    def start(cls, job: PairTraining) -> _TrainingProcess:
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=train_in_process, args=(job, sender), daemon=True)
+        process = context.Process(target=_train_in_process, args=(job, sender), daemon=True)
         process.start()
         # Only the child keeps the sending end, so that its death closes the pipe.
         sender.close()
@@ -81,7 +81,7 @@ class TrainingProcess(NamedTuple):
             raise TrainingError(message)
 
 
-def train_in_process(job: PairTraining, errors: connection.Connection) -> None:
+def _train_in_process(job: PairTraining, errors: connection.Connection) -> None:
     # Ctrl-C reaches all processes of a terminal; the main one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

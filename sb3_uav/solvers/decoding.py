@@ -22,16 +22,16 @@ DECODINGS = ("greedy", "sampling", "augment")
 SAMPLE_BLOCK = 64
 # An allocator with sweep starts at several gaps between the tasks, in both directions: the best of 128 samples then found 0.6
 # to 1.4 % more tasks than with the widest gap alone. The number of sweeps divides the block sizes.
-N_SWEEPS = 8
+_N_SWEEPS = 8
 # Number of views in augmentation before the sweep starts at another gap: all symmetries, swept in both directions.
-N_DIRECTIONS = 2
-N_VIEWS = N_DIRECTIONS * N_SYMMETRIES
+_N_DIRECTIONS = 2
+_N_VIEWS = _N_DIRECTIONS * N_SYMMETRIES
 # It reserves a part of its samples for more tours of the best few allocations. With 128 samples, 96 allocations and 8 more
 # tours for each of the best 4 found 0.6 to 1.7 % more tasks than 8 tours for each of 16 allocations.
-N_REVISITED, REVISITED_PART = 4, 0.25
+_N_REVISITED, REVISITED_PART = 4, 0.25
 # Under a time limit, blocks are smaller, so that the clock is read more often: twice as many views overran one second at
 # 1,000 tasks.
-HURRIED_BLOCK, HURRIED_VIEWS = 16, 2
+_HURRIED_BLOCK, _HURRIED_VIEWS = 16, 2
 
 
 class View(NamedTuple):
@@ -46,13 +46,13 @@ class View(NamedTuple):
     sweep: int
 
 
-def view_of(number: int) -> View:
+def _view_of(number: int) -> View:
     """
     :param number: Number of an allocation in augmentation, from 0
     :return: Its view: after all symmetries in both directions, the sweep starts at another gap
     """
-    turn, number = divmod(number, N_VIEWS)
-    return View(number // N_DIRECTIONS, turn * N_DIRECTIONS + number % N_DIRECTIONS)
+    turn, number = divmod(number, _N_VIEWS)
+    return View(number // _N_DIRECTIONS, turn * _N_DIRECTIONS + number % _N_DIRECTIONS)
 
 
 class Allocations(NamedTuple):
@@ -108,13 +108,13 @@ class Decoder:
             order = self.allocator.task_order(instances)
             arranged = instances.reorder(order)
             planned = plan_tours(arranged, self.allocator.decode_episodes(arranged), self.router.plan)
-            yield Block(planned.value, tours_of_tasks(planned.tours, order))
+            yield Block(planned.value, _tours_of_tasks(planned.tours, order))
         if self.decode == "sampling":
-            size = HURRIED_BLOCK if hurry else SAMPLE_BLOCK
-            views = [View(0, sweep) for sweep in range(N_SWEEPS if self.allocator.sweep else 1)]
+            size = _HURRIED_BLOCK if hurry else SAMPLE_BLOCK
+            views = [View(0, sweep) for sweep in range(_N_SWEEPS if self.allocator.sweep else 1)]
             for first in range(0, self.samples, size):
                 looks = [
-                    self.look(instances[i], views, random_generator(instances, seed, row, first), size // len(views))
+                    self.look(instances[i], views, _random_generator(instances, seed, row, first), size // len(views))
                     for i, row in enumerate(rows)
                 ]
                 yield self._plan([look.first(self.samples - first) for look in looks])
@@ -129,15 +129,15 @@ class Decoder:
         :param hurry: Whether to use smaller blocks
         :return: Schedules of all views, the first of which have greedy allocations; then more tours for the best allocations
         """
-        n_tours = int(REVISITED_PART * self.samples) // N_REVISITED
+        n_tours = int(REVISITED_PART * self.samples) // _N_REVISITED
         # A single tour would repeat the greedy one.
-        n_allocations = self.samples - (N_REVISITED * n_tours if n_tours > 1 else 0)
-        size = HURRIED_VIEWS if hurry else N_VIEWS
+        n_allocations = self.samples - (_N_REVISITED * n_tours if n_tours > 1 else 0)
+        size = _HURRIED_VIEWS if hurry else _N_VIEWS
         values, assignments = [], []
         for first in range(0, n_allocations, size):
-            views = [view_of(number) for number in range(first, min(first + size, n_allocations))]
+            views = [_view_of(number) for number in range(first, min(first + size, n_allocations))]
             looks = [
-                self.look(instances[i], views, random_generator(instances, seed, row, first), int(first >= N_VIEWS))
+                self.look(instances[i], views, _random_generator(instances, seed, row, first), int(first >= _N_VIEWS))
                 for i, row in enumerate(rows)
             ]
             block = self._plan(looks)
@@ -145,11 +145,11 @@ class Decoder:
             assignments.append(th.stack([look.in_input_order() for look in looks]))
             yield block
         if n_tours > 1:
-            best = th.cat(values, dim=1).sort(dim=1, descending=True, stable=True).indices[:, :N_REVISITED]
+            best = th.cat(values, dim=1).sort(dim=1, descending=True, stable=True).indices[:, :_N_REVISITED]
             assignment = th.cat(assignments, dim=1)
             blocks = []
             for i, row in enumerate(rows):
-                generator = random_generator(instances, seed, row, self.samples)
+                generator = _random_generator(instances, seed, row, self.samples)
                 again = plan_tours(instances[i], assignment[i, best[i]][None], self._several_tours(n_tours, generator))
                 blocks.append(Block(again.value, again.tours))
             yield Block.concatenate(blocks)
@@ -184,11 +184,11 @@ class Decoder:
         """
         instances, order = Instances.concatenate([look.instances for look in looks]), th.cat([look.order for look in looks])
         planned = plan_tours(instances, th.cat([look.assignment for look in looks])[:, None], self.router.plan)
-        tours = tours_of_tasks(planned.tours, order)
+        tours = _tours_of_tasks(planned.tours, order)
         return Block(planned.value.view(len(looks), -1), tours.view(len(looks), -1, *tours.shape[2:]))
 
 
-def random_generator(instances: Instances, *seed: int) -> th.Generator:
+def _random_generator(instances: Instances, *seed: int) -> th.Generator:
     """
     :param instances: Instances on the device where random numbers are needed
     :param seed: Numbers that the random numbers depend on
@@ -197,7 +197,7 @@ def random_generator(instances: Instances, *seed: int) -> th.Generator:
     return th.Generator(instances.device).manual_seed(int(mixed_state(*seed) >> np.uint64(1)))
 
 
-def tours_of_tasks(tours: th.Tensor, order: th.Tensor) -> th.Tensor:
+def _tours_of_tasks(tours: th.Tensor, order: th.Tensor) -> th.Tensor:
     """
     :param tours: ``(batch, n_samples, n_uavs, n_steps)`` int64, places of tasks in the order, -1 as padding
     :param order: ``(batch, n_tasks)`` int64, which task stands in each place

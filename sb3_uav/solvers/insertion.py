@@ -11,7 +11,7 @@ from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.solvers.base import OneByOneSolver, Solution
 
 # Insertions that add no length are all equally good, whatever rounding makes of their lengths; the value decides among them.
-SMALLEST_DETOUR = 1e-12
+_SMALLEST_DETOUR = 1e-12
 
 
 class GreedyInsertion(OneByOneSolver):
@@ -44,7 +44,7 @@ def insert_greedily(reduced: ReducedInstance, given: Sequence[Sequence[int]] = (
     free = np.ones(reduced.n_tasks, dtype=bool)
     free[[node - 1 for route in routes for node in route]] = False
     while True:
-        rate = np.where(free & (detour <= slack[:, None]), reduced.values / np.maximum(detour, SMALLEST_DETOUR), 0.0)
+        rate = np.where(free & (detour <= slack[:, None]), reduced.values / np.maximum(detour, _SMALLEST_DETOUR), 0.0)
         uav, task = np.unravel_index(rate.argmax(), rate.shape)
         if rate[uav, task] == 0:
             return routes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MAX_LLOYD_ITERATIONS = 100
+_MAX_LLOYD_ITERATIONS = 100
 
 
 def checked_restarts(restarts: int, solver: str) -> int:
@@ -65,7 +65,7 @@ def _lloyd(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, float]:
     :return: The cluster of each point, ``(n_points,)`` int64, and the sum of squared distances to their centers
     """
     labels = np.full(len(points), -1)
-    for _ in range(MAX_LLOYD_ITERATIONS):
+    for _ in range(_MAX_LLOYD_ITERATIONS):
         distances = np.square(points[:, None] - centers).sum(-1)
         previous, labels = labels, distances.argmin(1)
         if np.array_equal(labels, previous):

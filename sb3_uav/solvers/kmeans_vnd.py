@@ -41,7 +41,7 @@ class KMeansVND(OneByOneSolver):
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
         start = nearest_feasible_schedule(instance, clusters)
-        return Solution(Schedule(descend(instance, clusters == uav, route) for uav, route in enumerate(start.routes)))
+        return Solution(Schedule(_descend(instance, clusters == uav, route) for uav, route in enumerate(start.routes)))
 
 
 @cache
@@ -52,7 +52,7 @@ def _warm_up() -> None:
     warm_up()
 
 
-def descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tuple[int, ...]:
+def _descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tuple[int, ...]:
     """
     :param instance: A batch of one
     :param mine: ``(n_tasks,)`` bool, the tasks that the UAV may visit

@@ -9,7 +9,7 @@ from sb3_uav.solvers.base import OneByOneSolver
 from sb3_uav.solvers.unavailable import UnavailableError
 
 
-class TimeLimitError(UnavailableError):
+class _TimeLimitError(UnavailableError):
     """A time limit that is not a finite number above 0."""
 
 
@@ -21,7 +21,7 @@ def deadline_after(time_limit: float, whose: str) -> float:
     :raises TimeLimitError: If the limit is not a finite number above 0
     """
     if not 0 < time_limit < math.inf:
-        raise TimeLimitError(f"time_limit of {whose} is {time_limit:g} seconds; it must be more than 0, and finite.")
+        raise _TimeLimitError(f"time_limit of {whose} is {time_limit:g} seconds; it must be more than 0, and finite.")
     return time.perf_counter() + time_limit
 
 

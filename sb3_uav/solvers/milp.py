@@ -19,10 +19,10 @@ from sb3_uav.solvers.programs import BACKENDS, Program, Rows
 # Tasks nearer to each other than this, in units of the maximum flight distance, are one place.
 COINCIDENT = 1e-12
 # By how much a tour may exceed 1: less than the reduction leaves of the checker's tolerance.
-LENGTH_TOLERANCE = 1e-13
+_LENGTH_TOLERANCE = 1e-13
 
 
-class Places(NamedTuple):
+class _Places(NamedTuple):
     """
     The distinct positions of the tasks; ``n`` of them are not the depot.
 
@@ -36,7 +36,7 @@ class Places(NamedTuple):
     values: np.ndarray
 
     @classmethod
-    def of(cls, reduced: ReducedInstance) -> Places:
+    def of(cls, reduced: ReducedInstance) -> _Places:
         """
         :param reduced: The reduced instance
         :return: Its places
@@ -58,7 +58,7 @@ class Places(NamedTuple):
     def is_tour(self, cycle: Sequence[int]) -> bool:
         """Whether a cycle of places goes through the depot and is short enough."""
         length = math.fsum(self.distances[a, b] for a, b in pairwise((*cycle, cycle[0])))
-        return 0 in cycle and length <= 1 + LENGTH_TOLERANCE
+        return 0 in cycle and length <= 1 + _LENGTH_TOLERANCE
 
 
 class MILP(TimeLimitedSolver):
@@ -99,9 +99,9 @@ class MILP(TimeLimitedSolver):
         :raises ValueError: If the model of one of them is too large for the backend
         """
         for row in range(len(instances)):
-            places = Places.of(ReducedInstance.of(instances[row]))
+            places = _Places.of(ReducedInstance.of(instances[row]))
             try:
-                self.backend.check_size(*program_size(len(places.values), instances.n_uavs))
+                self.backend.check_size(*_program_size(len(places.values), instances.n_uavs))
             except ValueError as error:
                 raise ValueError(f"instance {row}: {error}.") from error
 
@@ -110,20 +110,20 @@ class MILP(TimeLimitedSolver):
         deadline = self.deadline(time_limit)
         seed = int(rng.integers(2**30))
         reduced = ReducedInstance.of(instance)
-        places = Places.of(reduced)
-        self.backend.check_size(*program_size(len(places.values), reduced.fleet_size))
+        places = _Places.of(reduced)
+        self.backend.check_size(*_program_size(len(places.values), reduced.fleet_size))
         free_value = math.fsum(reduced.values[node - 1] for node in places.nodes[0])
         bound = math.fsum(reduced.values)
         value = 0.0
         tours: list[tuple[int, ...]] = [(0,)]
         forbidden: list[tuple[int, ...]] = []
         while len(places.values) > 0 and (remaining := deadline - time.perf_counter()) > 0:
-            program = paper_program(places, reduced.fleet_size, forbidden)
+            program = _paper_program(places, reduced.fleet_size, forbidden)
             answer = self.backend.solve(program, remaining, self.threads, seed)
             bound = min(bound, free_value + answer.bound * places.values.max())
             if answer.columns is None:
                 break
-            cycles = flown_cycles(answer.columns, len(places.values))
+            cycles = _flown_cycles(answer.columns, len(places.values))
             found = [cycle for cycle in cycles if places.is_tour(cycle)]
             found_value = math.fsum(map(places.tour_value, found))
             if found_value > value:
@@ -149,17 +149,17 @@ def _arcs(n_places: int) -> tuple[np.ndarray, np.ndarray]:
     return start, end
 
 
-def program_size(n_places: int, n_uavs: int) -> tuple[int, int]:
+def _program_size(n_places: int, n_uavs: int) -> tuple[int, int]:
     """
     :param n_places: Number of places
     :param n_uavs: Number of UAVs
-    :return: Number of columns and of rows of :func:`paper_program`
+    :return: Number of columns and of rows of :func:`_paper_program`
     """
     n_uavs = min(n_uavs, n_places)
     return n_uavs * n_places * (n_places + 3), n_uavs * (n_places**2 + 2 * n_places + 3) + n_places + 1
 
 
-def paper_program(places: Places, n_uavs: int, forbidden: Sequence[tuple[int, ...]] = ()) -> Program:
+def _paper_program(places: _Places, n_uavs: int, forbidden: Sequence[tuple[int, ...]] = ()) -> Program:
     """
     The paper's model, its numbers in brackets below; distances are in units of the maximum flight distance.
 
@@ -222,9 +222,9 @@ def paper_program(places: Places, n_uavs: int, forbidden: Sequence[tuple[int, ..
     return rows.program(objective, column_upper, binary)
 
 
-def flown_cycles(columns: np.ndarray, n_places: int) -> list[tuple[int, ...]]:
+def _flown_cycles(columns: np.ndarray, n_places: int) -> list[tuple[int, ...]]:
     """
-    :param columns: A solution of :func:`paper_program`
+    :param columns: A solution of :func:`_paper_program`
     :param n_places: Number of places
     :return: The cycles of places that its UAVs fly; those through the depot start with it, which is 0
     """

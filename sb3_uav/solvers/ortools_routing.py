@@ -16,9 +16,9 @@ from sb3_uav.solvers.base import OneByOneSolver, Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver
 
 # Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
-LARGEST_PRIZE = 1_000_000
+_LARGEST_PRIZE = 1_000_000
 # More than any move of the local search takes.
-SECONDS_PER_MOVE = 86_400
+_SECONDS_PER_MOVE = 86_400
 # OR-Tools adds in int64; this leaves room for the distances.
 LARGEST_COST = 2**60
 
@@ -91,7 +91,7 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
     routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(reduced.coarse_distances().tolist()))
     flown = routing.RegisterTransitMatrix(reduced.fine_distances().tolist())
     routing.AddDimension(flown, 0, FINE_RESOLUTION, True, "distance")
-    for node, penalty in enumerate(reduced.integer_prizes(LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
+    for node, penalty in enumerate(reduced.integer_prizes(_LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
         routing.AddDisjunction([manager.NodeToIndex(node)], penalty)
     solution = routing.SolveWithParameters(_search_parameters(pywrapcp, deadline))
     if solution is None and deadline is not None:
@@ -132,7 +132,7 @@ def _search_parameters(pywrapcp: Any, deadline: float | None) -> Any:
     if deadline is None:
         parameters.local_search_metaheuristic = enums.LocalSearchMetaheuristic.GREEDY_DESCENT
         # By default some of its moves give up after 0.1 s, and a busy machine finds another local optimum.
-        parameters.lns_time_limit.FromSeconds(SECONDS_PER_MOVE)
+        parameters.lns_time_limit.FromSeconds(_SECONDS_PER_MOVE)
     else:
         parameters.local_search_metaheuristic = enums.LocalSearchMetaheuristic.GUIDED_LOCAL_SEARCH
         # Building the model counts too.

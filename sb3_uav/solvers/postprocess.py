@@ -15,14 +15,14 @@ from sb3_uav.envs.schedule import Schedule
 
 # How many of the best schedules of an instance are repaired, in a few milliseconds each. Of 128, repairing 64 gave 0.2 to
 # 0.8 % more tasks than repairing 8 at 80 to 200 tasks; repairing all gave no more.
-N_REPAIRED = 64
+_N_REPAIRED = 64
 # Fraction of the polishing time for ruin and recreate, before PyVRP. In one second, from the same schedules, ruin and recreate
 # found more than PyVRP from 500 tasks on, and less at 80 to 200 tasks; half and half was as good as the better of the two.
-RUIN_SHARE = 0.5
+_RUIN_SHARE = 0.5
 # Fraction of a time limit reserved for repair, and for polishing.
-REPAIR_SHARE, POLISH_SHARE = 0.3, 0.75
+_REPAIR_SHARE, _POLISH_SHARE = 0.3, 0.75
 # Seconds for the repair when the networks have used up the time limit.
-LEAST_REPAIR_SECONDS = 0.05
+_LEAST_REPAIR_SECONDS = 0.05
 
 
 class Refinement:
@@ -55,12 +55,12 @@ class Refinement:
     @property
     def share(self) -> float:
         """Fraction of a time limit reserved for it."""
-        return POLISH_SHARE if self.polish > 0 else REPAIR_SHARE if self.repair else 0.0
+        return _POLISH_SHARE if self.polish > 0 else _REPAIR_SHARE if self.repair else 0.0
 
     @property
     def n_candidates(self) -> int:
         """How many candidate schedules of an instance it considers."""
-        return N_REPAIRED if self.repair else 1
+        return _N_REPAIRED if self.repair else 1
 
     @property
     def label(self) -> str:
@@ -85,11 +85,11 @@ class Refinement:
         # The remaining time is divided equally among the instances; polishing, if requested, gets 70 % of it.
         n_rounds = math.ceil(len(instances) / n_threads)
         left = (deadline - time.perf_counter()) / n_rounds
-        repairing = left * (REPAIR_SHARE if self.polish > 0 else 1.0)
+        repairing = left * (_REPAIR_SHARE if self.polish > 0 else 1.0)
         with ThreadPoolExecutor(n_threads) as pool:
             best = [found[0] for found in candidates]
             if self.repair:
-                seconds = None if math.isinf(repairing) else max(repairing, LEAST_REPAIR_SECONDS)
+                seconds = None if math.isinf(repairing) else max(repairing, _LEAST_REPAIR_SECONDS)
                 best = list(pool.map(lambda i: repair_best(instances[i], candidates[i], seconds), range(len(instances))))
             seconds = min(self.polish, (deadline - time.perf_counter()) / n_rounds)
             if seconds <= 0:
@@ -115,7 +115,7 @@ def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 
     from sb3_uav.solvers.pyvrp_search import has_pyvrp, polish_schedule
 
     start = time.perf_counter()
-    share = RUIN_SHARE if has_pyvrp() else 1.0
+    share = _RUIN_SHARE if has_pyvrp() else 1.0
     n_tasks = max(int(instance.task_mask.sum()), 1)
     instance = instance.trim(n_tasks)
     found = improve(instance, schedule, share * seconds, seed)

@@ -14,10 +14,10 @@ from sb3_uav.common.optional import require
 from sb3_uav.solvers.unavailable import UnavailableError
 
 # Tolerance that the solvers are given for constraints, for integers, and for the gap between the best value and its bound.
-SOLVER_TOLERANCE = 1e-9
+_SOLVER_TOLERANCE = 1e-9
 # Columns, and rows, of the largest program: about 4 GB in HiGHS, and of the largest that Gurobi's free license admits.
-LARGEST_SIZE = 2_000_000
-FREE_LICENSE_SIZE = 2000
+_LARGEST_SIZE = 2_000_000
+_FREE_LICENSE_SIZE = 2000
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Rows:
         return Program(objective, column_upper, binary, lower, upper, starts, columns[order], coefficients[order])
 
 
-class Answer(NamedTuple):
+class _Answer(NamedTuple):
     """
     The answer of a backend.
 
@@ -103,7 +103,7 @@ class Answer(NamedTuple):
     bound: float
 
 
-class Backend(ABC):
+class _Backend(ABC):
     """
     A solver of programs.
 
@@ -111,11 +111,11 @@ class Backend(ABC):
     :ivar size_reason: Why not more, and what to do then
     """
 
-    size_limit = LARGEST_SIZE
+    size_limit = _LARGEST_SIZE
     size_reason = "which already takes some 4 GB of memory; use another solver for so many tasks"
 
     @abstractmethod
-    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> Answer:
+    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> _Answer:
         """
         :param program: A program that has a solution, and of a size that :meth:`check_size` allows
         :param time_limit: Seconds
@@ -137,7 +137,7 @@ class Backend(ABC):
             )
 
 
-class HiGHSBackend(Backend):
+class _HiGHSBackend(_Backend):
     """
     :raises ImportError: If highspy is not installed
     """
@@ -145,7 +145,7 @@ class HiGHSBackend(Backend):
     def __init__(self) -> None:
         require("highspy", "Solver milp", "solvers")
 
-    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> Answer:
+    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> _Answer:
         highspy: Any = require("highspy", "Solver milp", "solvers")
         model = highspy.HighsLp()
         model.sense_ = highspy.ObjSense.kMaximize
@@ -168,9 +168,9 @@ class HiGHSBackend(Backend):
             "threads": threads,
             "random_seed": seed,
             "mip_rel_gap": 0.0,
-            "mip_abs_gap": SOLVER_TOLERANCE,
-            "mip_feasibility_tolerance": SOLVER_TOLERANCE,
-            "primal_feasibility_tolerance": SOLVER_TOLERANCE,
+            "mip_abs_gap": _SOLVER_TOLERANCE,
+            "mip_feasibility_tolerance": _SOLVER_TOLERANCE,
+            "primal_feasibility_tolerance": _SOLVER_TOLERANCE,
         }.items():
             solver.setOptionValue(option, value)
         solver.passModel(model)
@@ -179,10 +179,10 @@ class HiGHSBackend(Backend):
         if status not in (highspy.HighsModelStatus.kOptimal, highspy.HighsModelStatus.kTimeLimit):
             raise RuntimeError(f"HiGHS ended with the status {solver.modelStatusToString(status)!r} on a feasible program.")
         has_solution = info.primal_solution_status == highspy.kSolutionStatusFeasible
-        return Answer(np.array(solver.getSolution().col_value) if has_solution else None, info.mip_dual_bound)
+        return _Answer(np.array(solver.getSolution().col_value) if has_solution else None, info.mip_dual_bound)
 
 
-class GurobiBackend(Backend):
+class _GurobiBackend(_Backend):
     """
     :raises ImportError: If gurobipy is not installed
     :raises UnavailableError: If Gurobi finds no valid license
@@ -192,13 +192,13 @@ class GurobiBackend(Backend):
         gurobipy, environment = self._start()
         # Gurobi has no other way to ask what a license admits.
         with environment, gurobipy.Model(env=environment) as model:
-            model.addVars(FREE_LICENSE_SIZE + 1)
+            model.addVars(_FREE_LICENSE_SIZE + 1)
             try:
                 model.optimize()
             except gurobipy.GurobiError as error:
                 if error.errno != gurobipy.GRB.Error.SIZE_LIMIT_EXCEEDED:
                     raise self._refused(error) from error
-                self.size_limit = FREE_LICENSE_SIZE
+                self.size_limit = _FREE_LICENSE_SIZE
                 self.size_reason = "which is what Gurobi's free license admits; install another, or use milp:backend=highs"
 
     @staticmethod
@@ -215,7 +215,7 @@ class GurobiBackend(Backend):
         except gurobipy.GurobiError as error:
             raise self._refused(error) from error
 
-    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> Answer:
+    def solve(self, program: Program, time_limit: float, threads: int, seed: int) -> _Answer:
         gurobipy, environment = self._start()
         constants = gurobipy.GRB
         with environment, gurobipy.Model(env=environment) as model:
@@ -224,9 +224,9 @@ class GurobiBackend(Backend):
                 "Threads": threads,
                 "Seed": seed,
                 "MIPGap": 0.0,
-                "MIPGapAbs": SOLVER_TOLERANCE,
-                "FeasibilityTol": SOLVER_TOLERANCE,
-                "IntFeasTol": SOLVER_TOLERANCE,
+                "MIPGapAbs": _SOLVER_TOLERANCE,
+                "FeasibilityTol": _SOLVER_TOLERANCE,
+                "IntFeasTol": _SOLVER_TOLERANCE,
             }.items():
                 model.setParam(parameter, value)
             model.ModelSense = constants.MAXIMIZE
@@ -245,7 +245,7 @@ class GurobiBackend(Backend):
             model.optimize()
             if model.Status not in (constants.OPTIMAL, constants.TIME_LIMIT):
                 raise RuntimeError(f"Gurobi ended with the status {model.Status} on a feasible program.")
-            return Answer(np.array(model.getAttr("X", columns)) if model.SolCount > 0 else None, model.ObjBound)
+            return _Answer(np.array(model.getAttr("X", columns)) if model.SolCount > 0 else None, model.ObjBound)
 
 
-BACKENDS: dict[str, Callable[[], Backend]] = {"highs": HiGHSBackend, "gurobi": GurobiBackend}
+BACKENDS: dict[str, Callable[[], _Backend]] = {"highs": _HiGHSBackend, "gurobi": _GurobiBackend}

@@ -18,15 +18,15 @@ from sb3_uav.solvers.limits import TimeLimitedSolver, deadline_after
 from sb3_uav.solvers.overlong_tours import with_feasible_tours
 
 # Its interface changes with every minor version.
-SUPPORTED_VERSION = "0.14."
-NUM_NEIGHBOURS = 20
+_SUPPORTED_VERSION = "0.14."
+_NUM_NEIGHBOURS = 20
 # Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
-LARGEST_PRIZE = 100_000
+_LARGEST_PRIZE = 100_000
 # How far PyVRP may raise the cost of tours that are too long: for an excess of the maximum flight distance, to so many times
 # the largest prize. Its own bound, per unit of distance, suffices for equal values; it is far too low for prizes that differ
 # much, because infeasible tours would pay and no feasible schedule be found.
-PENALTY_PER_PRIZE = 1000
-DEFAULT_MAX_PENALTY = 100_000.0
+_PENALTY_PER_PRIZE = 1000
+_DEFAULT_MAX_PENALTY = 100_000.0
 # PyVRP adds in int64; this leaves room for the sum of two costs.
 LARGEST_COST = 2**61
 
@@ -44,7 +44,7 @@ class PyVRP(TimeLimitedSolver):
 
     name = "pyvrp"
 
-    def __init__(self, time_limit: float = 10.0, num_neighbours: int = NUM_NEIGHBOURS) -> None:
+    def __init__(self, time_limit: float = 10.0, num_neighbours: int = _NUM_NEIGHBOURS) -> None:
         super().__init__(time_limit)
         if num_neighbours < 1:
             raise ValueError(f"num_neighbours of pyvrp is {num_neighbours}; give at least 1.")
@@ -57,7 +57,7 @@ class PyVRP(TimeLimitedSolver):
 
 
 def polish_schedule(
-    instance: Instances, schedule: Schedule, time_limit: float, seed: int = 0, num_neighbours: int = NUM_NEIGHBOURS
+    instance: Instances, schedule: Schedule, time_limit: float, seed: int = 0, num_neighbours: int = _NUM_NEIGHBOURS
 ) -> Schedule:
     """
     Improve a schedule with PyVRP, which starts from it.
@@ -92,7 +92,7 @@ def _require_pyvrp(solver: str) -> Any:
     """
     pyvrp = require("pyvrp", f"Solver {solver}", "solvers")
     found = version("pyvrp")
-    if not found.startswith(SUPPORTED_VERSION):
+    if not found.startswith(_SUPPORTED_VERSION):
         raise ImportError(
             f"Solver {solver} needs PyVRP 0.14, which needs Python 3.11 or newer; found PyVRP {found}. "
             f"Run: {install_command('solvers')}"
@@ -118,11 +118,11 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
     reduced = ReducedInstance.of(instance)
     if reduced.n_tasks == 0:
         return reduced.schedule([])
-    prizes = reduced.integer_prizes(LARGEST_PRIZE, LARGEST_COST // PENALTY_PER_PRIZE)
+    prizes = reduced.integer_prizes(_LARGEST_PRIZE, LARGEST_COST // _PENALTY_PER_PRIZE)
     data = _problem_data(pyvrp, reduced, prizes)
     params = pyvrp.SolveParams(
         neighbourhood=pyvrp.search.NeighbourhoodParams(num_neighbours=num_neighbours),
-        penalty=pyvrp.PenaltyParams(max_penalty=max(DEFAULT_MAX_PENALTY, PENALTY_PER_PRIZE * prizes.max() / RESOLUTION)),
+        penalty=pyvrp.PenaltyParams(max_penalty=max(_DEFAULT_MAX_PENALTY, _PENALTY_PER_PRIZE * prizes.max() / RESOLUTION)),
     )
 
     least_prize = int(prizes.min())

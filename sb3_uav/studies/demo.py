@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
+from sb3_uav.common.epoch_log import LOG_FILE
 from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
 from sb3_uav.envs import TaskAllocationEnv
 from sb3_uav.evaluation import evaluate, print_table
@@ -19,7 +20,6 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.dl_drl import DLDRL
-from sb3_uav.training.epoch_log import LOG_FILE
 
 
 def newest_run(folder: Path, env_id: str) -> Path:

@@ -1,6 +1,6 @@
+from sb3_uav.policies.freezing import Freezer
 from sb3_uav.training.episode_buffer import EpisodeBufferCallback, EpisodeRolloutBuffer, MaskableEpisodeRolloutBuffer
 from sb3_uav.training.fixed_set import FixedSetEvalCallback
-from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.its import ITSCallback
 from sb3_uav.training.pretrained_router import PretrainedRouterCallback
 from sb3_uav.training.size_grid import SizeGridCallback

@@ -11,16 +11,16 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 
+from sb3_uav.common.callback_tree import siblings, walk_callbacks
 from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.training.callback_tree import siblings, walk_callbacks
 
 BEST_MODEL_FILE = "best_model.zip"
-BEST_ROUTER_FILE = "best_router.zip"
-PAIR_FILE = "best_pair.json"
+_BEST_ROUTER_FILE = "best_router.zip"
+_PAIR_FILE = "best_pair.json"
 # Complete, but not yet in place.
-NEXT_MODEL_FILE = "best_model.next.zip"
-NEXT_ROUTER_FILE = "best_router.next.zip"
+_NEXT_MODEL_FILE = "best_model.next.zip"
+_NEXT_ROUTER_FILE = "best_router.next.zip"
 
 
 class BestPair:
@@ -69,8 +69,8 @@ class BestPair:
     def _replace(
         self, write_model: Callable[[Path], None], write_router: Callable[[Path], None] | None, about: dict[str, Any]
     ) -> None:
-        model, router, note = (self.folder / name for name in (BEST_MODEL_FILE, BEST_ROUTER_FILE, PAIR_FILE))
-        next_model, next_router = self.folder / NEXT_MODEL_FILE, self.folder / NEXT_ROUTER_FILE
+        model, router, note = (self.folder / name for name in (BEST_MODEL_FILE, _BEST_ROUTER_FILE, _PAIR_FILE))
+        next_model, next_router = self.folder / _NEXT_MODEL_FILE, self.folder / _NEXT_ROUTER_FILE
         # What an interruption has left comes first, because the file with the router's next name is overwritten below.
         if find_best_router(self.folder) == next_router:
             os.replace(next_router, router)
@@ -98,13 +98,13 @@ def find_best_router(folder: Path) -> Path | None:
     :param folder: Where a run keeps its best pair
     :return: The zip of the router that ``best_model.zip`` was evaluated with; None if the run has none
     """
-    plain = folder / BEST_ROUTER_FILE
+    plain = folder / _BEST_ROUTER_FILE
     try:
-        note = json.loads((folder / PAIR_FILE).read_text(encoding="utf-8"))
+        note = json.loads((folder / _PAIR_FILE).read_text(encoding="utf-8"))
         if note["model"] == file_hash(folder / BEST_MODEL_FILE):
             if note["router"] is None:
                 return None
-            for path in (plain, folder / NEXT_ROUTER_FILE):
+            for path in (plain, folder / _NEXT_ROUTER_FILE):
                 if path.is_file() and file_hash(path) == note["router"]:
                     return path
     except (OSError, ValueError, LookupError, TypeError):

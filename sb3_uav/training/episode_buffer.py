@@ -49,7 +49,7 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
     _starts: np.ndarray
     _fragments: np.ndarray
     _latest: dict[str, np.ndarray]
-    _step_fields: ClassVar[tuple[str, ...]] = ("actions", "values", "log_probs", "advantages", "returns")
+    step_fields: ClassVar[tuple[str, ...]] = ("actions", "values", "log_probs", "advantages", "returns")
 
     def __init__(
         self,
@@ -122,14 +122,14 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
             self._flatten()
         fragments = np.random.permutation(self._n_fragments)
         lengths = np.diff(self._starts)[fragments]
-        for chosen in split_evenly(lengths, batch_size or len(self._fragments)):
+        for chosen in _split_evenly(lengths, batch_size or len(self._fragments)):
             yield self._get_samples(np.concatenate([np.arange(*self._starts[i : i + 2]) for i in fragments[chosen]]))
 
     def _flatten(self) -> None:
         """Put the steps of each environment behind one another: every fragment is a run of them, numbered in this order."""
         for key, rows in self.observations.items():
             self.observations[key] = self.swap_and_flatten(rows)
-        for name in self._step_fields:
+        for name in self.step_fields:
             setattr(self, name, self.swap_and_flatten(getattr(self, name)))
         by_env = self.swap_and_flatten(self._fragments)[:, 0]
         self._starts = np.concatenate([[0], np.flatnonzero(np.diff(by_env)) + 1, [len(by_env)]])
@@ -149,10 +149,10 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
 class MaskableEpisodeRolloutBuffer(EpisodeRolloutBuffer, MaskableDictRolloutBuffer):  # type: ignore[misc]
     """:class:`EpisodeRolloutBuffer` for MaskablePPO; see there for the parameters."""
 
-    _step_fields = (*EpisodeRolloutBuffer._step_fields, "action_masks")
+    step_fields = (*EpisodeRolloutBuffer.step_fields, "action_masks")
 
 
-def split_evenly(lengths: np.ndarray, batch_size: int) -> list[np.ndarray]:
+def _split_evenly(lengths: np.ndarray, batch_size: int) -> list[np.ndarray]:
     """
     Cut a sequence of fragments into runs of about equally many steps.
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import FIXED_SET_STREAM, random_stream
 from sb3_uav.common.sb3_compat import n_updates
@@ -21,22 +22,21 @@ from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, BestPair, BestPairOwner, best_model_folder, find_best_router, take_over
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, FixedSetResult
 from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem
 from sb3_uav.training.instance_sets import InstanceSets, InstanceSource, SizeTable
 from sb3_uav.training.its import ITSCallback
 from sb3_uav.training.run_folder import find_run_folder
 
-INSTANCES_FILE = "evaluation_instances.npz"
+_INSTANCES_FILE = "evaluation_instances.npz"
 # Means by size, where there are several.
 TABLE_FILE = "size_grid.csv"
 # Where a stock EvalCallback of the same run writes its results instead; it appends the suffix .npz.
-STOCK_RESULTS = "evaluations_eval_callback"
+_STOCK_RESULTS = "evaluations_eval_callback"
 # An attribute of the model, so that every zip of it names its earlier evaluations: SB3 starts counting steps again from 0.
-STATE = "fixed_set_evaluations"
+_STATE = "fixed_set_evaluations"
 # SB3's EvalCallback is called every 10,000 calls, rl_zoo3's every 25,000 steps.
-DEFAULT_EVAL_FREQ = 25_000
+_DEFAULT_EVAL_FREQ = 25_000
 
 
 class FixedSetEvalCallback(BestPairOwner):
@@ -94,7 +94,7 @@ class FixedSetEvalCallback(BestPairOwner):
 
     # Two callbacks with the same name here cannot share a folder.
     results_file: ClassVar[str] = RESULTS_FILE
-    instances_file: ClassVar[str | None] = INSTANCES_FILE
+    instances_file: ClassVar[str | None] = _INSTANCES_FILE
     # Additional names for a copy of the best model.
     best_copies: ClassVar[tuple[str, ...]] = ()
 
@@ -228,7 +228,7 @@ class FixedSetEvalCallback(BestPairOwner):
     @property
     def _state(self) -> dict[str, Any]:
         """The model's own record: steps and seconds of training, and the folder of the evaluations of each set."""
-        return getattr(self.model, STATE, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
+        return getattr(self.model, _STATE, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
 
     def _note_state(self, seconds: np.ndarray) -> None:
         """
@@ -242,7 +242,7 @@ class FixedSetEvalCallback(BestPairOwner):
             "seconds": seconds.tolist(),
             "folders": {**self._state["folders"], self._fingerprint: folder},
         }
-        setattr(self.model, STATE, state)
+        setattr(self.model, _STATE, state)
 
     def _continue(self, sets: InstanceSets) -> None:
         """Continue the history of the model's earlier training, or begin a new one."""
@@ -295,7 +295,7 @@ class FixedSetEvalCallback(BestPairOwner):
             if best is not None and best.resolve() == folder.resolve():
                 take_over(other, self.model)
             if self.results_file == RESULTS_FILE and other.log_path is not None and Path(other.log_path).resolve() == results:
-                other.log_path = str(folder / STOCK_RESULTS)
+                other.log_path = str(folder / _STOCK_RESULTS)
 
     # ------------------------------------------------------------------------------------------------------ when
 
@@ -324,7 +324,7 @@ class FixedSetEvalCallback(BestPairOwner):
             return n_updates(self.model) // self.eval_updates > self._evaluated_updates // self.eval_updates
         if self.eval_freq is None and epoch is not None:
             return epoch > self._evaluated_epoch
-        frequency = self.eval_freq or DEFAULT_EVAL_FREQ
+        frequency = self.eval_freq or _DEFAULT_EVAL_FREQ
         return self._timesteps // frequency > last // frequency
 
     def _on_rollout_start(self) -> None:
@@ -382,8 +382,14 @@ class FixedSetEvalCallback(BestPairOwner):
         self._report(result, improved)
         pause = self._now() - self._clock_start - seconds
         for callback in (self, *siblings(self, FixedSetEvalCallback)):
-            callback._clock_start = callback._clock_start + pause
+            callback.leave_out(pause)
         return self.last_mean_reward
+
+    def leave_out(self, pause: np.ndarray) -> None:
+        """
+        :param pause: ``(2,)``, wall and CPU seconds that are no training time, such as those of an evaluation
+        """
+        self._clock_start = self._clock_start + pause
 
     def _save_best_pair(self, folder: Path) -> None:
         router = None if self._its is None else self._its.router

@@ -14,7 +14,7 @@ from sb3_uav.policies import EpisodicPolicy
 from sb3_uav.training.fixed_set_history import FixedSetResult
 
 # Number of instances decoded at once: the smaller of the paper's batch sizes.
-CHUNK_ROWS = 256
+_CHUNK_ROWS = 256
 
 
 def draw_fixed_set(problem: Problem, n_instances: int, seed: int) -> Instances:
@@ -47,7 +47,7 @@ def evaluate_fixed_set(
     try:
         fitting = policy.rows_that_fit(instances.n_tasks + 1, max(n_samples, 1) * instances.n_uavs)
         parts = []
-        for rows in th.arange(len(instances), device="cpu").split(min(CHUNK_ROWS, fitting)):
+        for rows in th.arange(len(instances), device="cpu").split(min(_CHUNK_ROWS, fitting)):
             first = int(rows[0])
             parts.append(_evaluate_chunk(policy, problem, instances[rows], n_samples, seed, first))
     finally:

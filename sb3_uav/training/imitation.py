@@ -23,16 +23,16 @@ from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.imitation_progress import ImitationProgress, Lesson
 
 # Number of tasks of a subset for which a batch holds exactly batch_size subsets; of larger subsets it holds fewer.
-TYPICAL_SIZE = 30
+_TYPICAL_SIZE = 30
 # Trials of the search per task. With 12, tours visit 99 % of the tasks that a search 25 times as long visits.
-TRIALS_PER_TASK = 12
-WARM_UP = 50
-LAST_RATE = 0.02
-MAX_GRAD_NORM = 1.0
-REPORT_EVERY = 250
+_TRIALS_PER_TASK = 12
+_WARM_UP = 50
+_LAST_RATE = 0.02
+_MAX_GRAD_NORM = 1.0
+_REPORT_EVERY = 250
 # Progress is saved every SAVE_EVERY updates and every CHUNK_SIZE tours.
-SAVE_EVERY = 500
-CHUNK_SIZE = 10_000
+_SAVE_EVERY = 500
+_CHUNK_SIZE = 10_000
 
 
 def imitate(
@@ -73,7 +73,7 @@ def imitate(
         raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
     settings = dict(n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size, learning_rate=learning_rate)
     progress = None if folder is None else ImitationProgress(Path(folder), settings)
-    lessons = search_lessons(allocator, generator, rng, n_subsets, batch_size, report, progress)
+    lessons = _search_lessons(allocator, generator, rng, n_subsets, batch_size, report, progress)
     optimizer = th.optim.Adam(router.parameters(), learning_rate)
     n_done = 0 if progress is None else progress.restore_updates(router, optimizer, rng)
     if n_done > 0:
@@ -83,8 +83,8 @@ def imitate(
     for update in range(n_done + 1, n_updates + 1):
         cosine = 0.5 * (1 + math.cos(math.pi * update / n_updates))
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate * min(1.0, update / WARM_UP) * (LAST_RATE + (1 - LAST_RATE) * cosine)
-        lesson = varied(lessons[int(rng.integers(len(lessons)))], rng, batch_size)
+            group["lr"] = learning_rate * min(1.0, update / _WARM_UP) * (_LAST_RATE + (1 - _LAST_RATE) * cosine)
+        lesson = _varied(lessons[int(rng.integers(len(lessons)))], rng, batch_size)
         lesson = Lesson(lesson.instances.to(router.device), lesson.tours.to(router.device))
         is_move = lesson.tours > 0
         n_new = int(is_move.sum())
@@ -92,19 +92,19 @@ def imitate(
         loss = -log_prob[is_move].sum() / max(n_new, 1)
         optimizer.zero_grad()
         loss.backward()
-        th.nn.utils.clip_grad_norm_(router.parameters(), MAX_GRAD_NORM)
+        th.nn.utils.clip_grad_norm_(router.parameters(), _MAX_GRAD_NORM)
         optimizer.step()
         total, n_moves = total + n_new * loss.detach(), n_moves + n_new
-        if update % REPORT_EVERY == 0 or update == n_updates:
+        if update % _REPORT_EVERY == 0 or update == n_updates:
             seconds, nats = time.perf_counter() - start, total.item() / max(n_moves, 1)
             report(f"imitation: {update} of {n_updates} updates, {nats:.3f} nats a move, {seconds:.0f} s")
             total, n_moves = th.zeros_like(total), 0
-        if progress is not None and update % SAVE_EVERY == 0:
+        if progress is not None and update % _SAVE_EVERY == 0:
             progress.save_updates(update, router, optimizer, rng)
     router.set_training_mode(False)
 
 
-def search_lessons(
+def _search_lessons(
     allocator: AllocatorPolicy,
     generator: InstanceGenerator,
     rng: np.random.Generator,
@@ -132,12 +132,12 @@ def search_lessons(
         actions = torch_generator(rng, allocator.device)
         assignment = allocator.decode_episodes(instances.to(allocator.device), deterministic=False, generator=actions)
         subsets = split_tasks(instances, assignment.cpu()).instances
-        n_rows = 2 * batch_size * TYPICAL_SIZE // subsets.n_tasks
+        n_rows = 2 * batch_size * _TYPICAL_SIZE // subsets.n_tasks
         subsets = subsets[rng.permutation(len(subsets))[: max(n_rows, 4)]]
         subsets = subsets.trim(max(int(subsets.task_mask.sum(1).max()), 1))
         lessons.append(Lesson(subsets, good_tours(subsets)))
         before, n_found = n_found, n_found + len(subsets)
-        if n_found // CHUNK_SIZE > before // CHUNK_SIZE or n_found >= n_subsets:
+        if n_found // _CHUNK_SIZE > before // _CHUNK_SIZE or n_found >= n_subsets:
             report(f"imitation: {n_found} of {n_subsets} tours, {time.perf_counter() - start:.0f} s")
             if progress is not None:
                 progress.save_lessons(lessons[n_saved:], rng)
@@ -153,14 +153,14 @@ def good_tours(subsets: Instances) -> th.Tensor:
     routes = []
     for row in range(len(subsets)):
         search = LocalSearch(subsets[row])
-        n_trials = TRIALS_PER_TASK * int(subsets.task_mask[row].sum())
+        n_trials = _TRIALS_PER_TASK * int(subsets.task_mask[row].sum())
         routes.append([task + 1 for task in search.improve(Schedule([]), n_trials=n_trials).routes[0]])
     n_steps = 1 + max(map(len, routes))
     padded = [route + [0] * (n_steps - len(route)) for route in routes]
     return th.tensor(padded, dtype=th.int64, device="cpu")
 
 
-def varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
+def _varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
     """
     :param lesson: Subsets and tours
     :param rng: Random generator
@@ -168,7 +168,7 @@ def varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson:
     :return: A random selection, about half of the tours reversed, each instance rotated around its depot
     """
     instances, tours = lesson
-    rows = rng.permutation(len(instances))[: max(batch_size * TYPICAL_SIZE // instances.n_tasks, 4)]
+    rows = rng.permutation(len(instances))[: max(batch_size * _TYPICAL_SIZE // instances.n_tasks, 4)]
     instances, tours = instances[rows], tours[rows]
     length = (tours > 0).sum(1, keepdim=True)
     steps = th.arange(tours.shape[1], device=tours.device)

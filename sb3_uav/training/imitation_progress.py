@@ -15,7 +15,7 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import RouterPolicy
 
-INSTANCE_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
+_INSTANCE_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
 
 
 class Lesson(NamedTuple):
@@ -51,7 +51,7 @@ class ImitationProgress:
         """
         # Copies, because torch saves the whole storage of a view.
         content = [
-            {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in INSTANCE_FIELDS}
+            {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in _INSTANCE_FIELDS}
             for lesson in lessons
         ]
         self._write(self._chunk_file(), rng, {"lessons": content})
@@ -146,7 +146,7 @@ def _lesson(fields: dict[str, Any]) -> Lesson:
     :raises ValueError: If tours and instances do not fit together; others if the fields are of other kinds
     """
     tours = fields["tours"]
-    instances = Instances(n_uavs=1, **{name: fields[name] for name in INSTANCE_FIELDS})
+    instances = Instances(n_uavs=1, **{name: fields[name] for name in _INSTANCE_FIELDS})
     if tours.dtype != th.int64 or tours.ndim != 2 or len(tours) != len(instances) or len(tours) == 0:
         raise ValueError(f"tours are {tours.dtype} of shape {tuple(tours.shape)} for {len(instances)} instances")
     if int(tours.min()) < 0 or int(tours.max()) > instances.n_tasks:

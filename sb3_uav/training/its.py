@@ -11,19 +11,20 @@ from typing import Any
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_uav.common.callback_tree import siblings
+from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, log_text
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
 from sb3_uav.common.sb3_compat import n_updates, total_timesteps
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.policies.freezing import Freezer
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.recognition import find_problem
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import RouterCallback, take_over
-from sb3_uav.training.callback_tree import siblings
-from sb3_uav.training.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, log_text
-from sb3_uav.training.freezing import Freezer
 from sb3_uav.training.its_checkpoint import (
     CHECKPOINT_FOLDER,
     WARM_START_FOLDER,
@@ -34,7 +35,6 @@ from sb3_uav.training.its_checkpoint import (
     write_checkpoint,
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
-from sb3_uav.training.random_state import undisturbed_random_state
 from sb3_uav.training.router_handover import hand_over_router
 from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer

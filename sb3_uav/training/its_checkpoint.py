@@ -11,10 +11,10 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_uav.common.epoch_log import EpochRecord
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training.epoch_log import EpochRecord
 
 CHECKPOINT_FOLDER = "its_checkpoint"
 STATE_FILE = "its_state.json"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY, INDEPENDENT = STRATEGIES = (
+ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY, INDEPENDENT = _STRATEGIES = (
     "its",
     "no-pretraining",
     "no-intensive",
@@ -20,20 +20,20 @@ PAPER_STRATEGIES = {
     "DL-DRL-I": INDEPENDENT,
 }
 
-PRETRAINING, INTENSIVE, ALTERNATE = "pre-training", "intensive", "alternate"
+PRETRAINING, _INTENSIVE, ALTERNATE = "pre-training", "intensive", "alternate"
 
 
 def strategy_name(strategy: str) -> str:
     """
-    :param strategy: One of :data:`STRATEGIES`, or its name in the paper
+    :param strategy: One of :data:`_STRATEGIES`, or its name in the paper
     :return: The former
     :raises ValueError: If there is no such strategy
     """
     name = PAPER_STRATEGIES.get(strategy, strategy) if isinstance(strategy, str) else None
-    if name not in STRATEGIES:
+    if name not in _STRATEGIES:
         paper = ", ".join(PAPER_STRATEGIES)
         raise ValueError(
-            f"strategy is {strategy!r}; choose one of {', '.join(STRATEGIES)} (in the paper's words, in this order: {paper})."
+            f"strategy is {strategy!r}; choose one of {', '.join(_STRATEGIES)} (in the paper's words, in this order: {paper})."
         )
     return name
 
@@ -59,7 +59,7 @@ class EpochSchedule:
     @classmethod
     def of(cls, strategy: str, n_epochs: int, n_pretraining: int, n_intensive: int, n_continuous: int) -> EpochSchedule:
         """
-        :param strategy: One of :data:`STRATEGIES`, or its name in the paper
+        :param strategy: One of :data:`_STRATEGIES`, or its name in the paper
         :param n_epochs: Allocator epochs
         :param n_pretraining: Router epochs of pre-training, if the strategy has it
         :param n_intensive: Allocator epochs of intensive training, if the strategy has it
@@ -90,7 +90,7 @@ class EpochSchedule:
         :param epoch: Number of an allocator epoch, from 1
         :return: The phase that it belongs to
         """
-        return INTENSIVE if epoch <= self.n_intensive_epochs else ALTERNATE
+        return _INTENSIVE if epoch <= self.n_intensive_epochs else ALTERNATE
 
     def router_epochs_after(self, epoch: int) -> int:
         """

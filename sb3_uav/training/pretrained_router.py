@@ -7,14 +7,14 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set_returns import evaluated_problem
 from sb3_uav.training.its import ROUTER_FILE, ITSCallback
-from sb3_uav.training.random_state import undisturbed_random_state
 from sb3_uav.training.router_handover import hand_over_router
 from sb3_uav.training.run_folder import find_run_folder
 

@@ -7,11 +7,11 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.sb3_compat import set_last_observation
 from sb3_uav.envs.routing import Router
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce.recognition import find_problem
-from sb3_uav.training.callback_tree import siblings
 
 
 def hand_over_router(callback: BaseCallback, router: Router) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback, tqdm
 
-from sb3_uav.training.callback_tree import siblings
+from sb3_uav.common.callback_tree import siblings
 
 
-class RouterProgress(BaseCallback):
+class _RouterProgress(BaseCallback):
     """
     Shows the progress of the router's epoch on the allocator's progress bar, because two bars at a time would disturb each
     other.
@@ -37,7 +37,7 @@ class RouterProgress(BaseCallback):
         self.bar.set_description(f"{self.description} {done:4.0%}")
 
 
-class OwnProgress(RouterProgress):
+class _OwnProgress(_RouterProgress):
     """The same on a bar of its own, for pre-training, when the allocator has none yet."""
 
     def report(self, done: float) -> None:
@@ -58,6 +58,6 @@ def router_progress(callback: BaseCallback, description: str, n_instances: int) 
     if getattr(bars[0], "pbar", None) is None:
         # Pre-training: the allocator's bar does not exist yet.
         bar = tqdm(total=n_instances, desc=description)
-        return [OwnProgress(description, bar, n_instances)], bar.close
+        return [_OwnProgress(description, bar, n_instances)], bar.close
     bar = bars[0].pbar
-    return [RouterProgress(description, bar, n_instances)], lambda: bar.set_description("allocator")
+    return [_RouterProgress(description, bar, n_instances)], lambda: bar.set_description("allocator")

@@ -13,18 +13,18 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_uav.common.epoch_log import EpisodeStatistics
+from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import forget_last_observation, set_last_observation
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.policies import RouterPolicy
+from sb3_uav.policies.freezing import Freezer
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training.algorithms import resolve_algorithm
+from sb3_uav.reinforce.algorithms import resolve_algorithm
 from sb3_uav.training.episode_buffer import use_episode_buffer
-from sb3_uav.training.epoch_log import EpisodeStatistics
-from sb3_uav.training.freezing import Freezer
-from sb3_uav.training.random_state import undisturbed_random_state
 from sb3_uav.training.subsets import WholeInstances
 
 # Settings that follow from the environment, or that the router's zip decides when a run is resumed.

@@ -8,9 +8,9 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import HumanOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.training.best_pair import best_model_folder
-from sb3_uav.training.callback_tree import siblings
 
 
 def find_run_folder(callback: BaseCallback) -> Path | None:

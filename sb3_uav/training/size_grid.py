@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.random_streams import GRID_SEED
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.allocation import AllocationProblem
@@ -15,13 +16,12 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
 from sb3_uav.training.best_pair import find_best_router
-from sb3_uav.training.callback_tree import siblings
 from sb3_uav.training.fixed_set import TABLE_FILE, FixedSetEvalCallback
 from sb3_uav.training.instance_sets import InstanceSets
 
 # UAVs, tasks, instances.
-DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
-BEST_ALLOCATOR_FILE = "best_allocator.zip"
+_DEFAULT_SIZES = ((4, 80, 48), (6, 80, 32), (4, 200, 16), (6, 200, 16), (4, 500, 8), (6, 500, 8))
+_BEST_ALLOCATOR_FILE = "best_allocator.zip"
 
 
 class SizeGridCallback(FixedSetEvalCallback):
@@ -43,11 +43,11 @@ class SizeGridCallback(FixedSetEvalCallback):
 
     results_file = "size_grid.npz"
     instances_file = None
-    best_copies = (BEST_ALLOCATOR_FILE,)
+    best_copies = (_BEST_ALLOCATOR_FILE,)
 
     def __init__(
         self,
-        sizes: Sequence[Sequence[int]] = DEFAULT_SIZES,
+        sizes: Sequence[Sequence[int]] = _DEFAULT_SIZES,
         max_distance: float = 2.0,
         freq: int = 100,
         n_samples: int | None = None,
@@ -121,5 +121,5 @@ class SizeGridCallback(FixedSetEvalCallback):
             self._restore_table(folder, names)
             best = max((row["score"] for row in self.table.rows), default=-np.inf)
             self.best_mean_reward = best
-            self._bring_best_pair(folder / BEST_ALLOCATOR_FILE, find_best_router(folder))
+            self._bring_best_pair(folder / _BEST_ALLOCATOR_FILE, find_best_router(folder))
             return

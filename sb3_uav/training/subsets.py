@@ -16,7 +16,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import AllocatorPolicy
 
 # Number of test instances allocated at once: the smaller of the paper's batch sizes.
-HELD_OUT_ROWS = 256
+_HELD_OUT_ROWS = 256
 
 
 class SingleUavGenerator:
@@ -144,6 +144,6 @@ class AllocatedSubsets(SingleUavGenerator):
         :param rng: Random generator
         """
         instances = self.allocator.arrange(self.generator(-(-batch_size // self.generator.n_uavs), rng))
-        rows = th.arange(len(instances), device="cpu").split(HELD_OUT_ROWS)
+        rows = th.arange(len(instances), device="cpu").split(_HELD_OUT_ROWS)
         subsets = Instances.concatenate([self._allocate(instances[part], rng) for part in rows])
         return subsets[rng.permutation(len(subsets))[:batch_size]]

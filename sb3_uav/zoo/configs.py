@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.type_aliases import Schedule
 
 import sb3_uav
+from sb3_uav.common.sb3_compat import linear_schedule
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
 
 # Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
@@ -126,7 +127,7 @@ def check_values(entry: dict[str, Any], where: str) -> None:
                 raise ValueError(f"{where}: the arguments of a callback are {_kind(arguments)}; write a mapping.")
 
 
-def parse_schedule(key: str, text: str) -> float | LinearSchedule:
+def parse_schedule(key: str, text: str) -> float | Schedule:
     """
     :param key: Name of the hyperparameter
     :param text: ``lin_X``, ``const_X`` or a number
@@ -142,4 +143,4 @@ def parse_schedule(key: str, text: str) -> float | LinearSchedule:
         return value
     if kind != "lin" or key == "ent_coef":
         raise ValueError(f"{key} is {text!r}; write a number{'' if key == 'ent_coef' else ', lin_X or const_X'}.")
-    return LinearSchedule(start=value, end=0.0, end_fraction=1.0)
+    return linear_schedule(value)

@@ -14,7 +14,7 @@ import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
 from sb3_uav.zoo.dependencies import require_zoo
 
-PROG = "sb3-uav enjoy"
+_PROG = "sb3-uav enjoy"
 
 
 def enjoy(arguments: Sequence[str]) -> None:
@@ -50,19 +50,19 @@ def enjoy(arguments: Sequence[str]) -> None:
         if not known.help:
             which = (known.load_best, known.load_checkpoint, known.load_last_checkpoint)
             _, model, run_folder = get_model_path(known.exp_id, known.folder, known.algo, known.env, *which)
-            router = find_router(Path(run_folder), known.load_best)
+            router = _find_router(Path(run_folder), known.load_best)
             if router is not None and (known.load_checkpoint is not None or known.load_last_checkpoint):
                 print("Checkpoints of the zoo hold no router: rewards come from the run's last one.")
         make_env = partial(_create_test_env, create_test_env, model, router)
         flags = ["--algo", known.algo, "-f", known.folder, *arguments]
-        with default_vec_env(make_batched_vec_env), replay_environment(make_env), command_line(PROG, flags):
+        with default_vec_env(make_batched_vec_env), replay_environment(make_env), command_line(_PROG, flags):
             rl_zoo3.enjoy.enjoy()
     except AssertionError as error:
         # rl_zoo3 raises it for a missing folder.
         raise ValueError(str(error)) from error
 
 
-def find_router(run_folder: Path, best: bool) -> Path | None:
+def _find_router(run_folder: Path, best: bool) -> Path | None:
     """
     :param run_folder: Folder of the allocator's zip
     :param best: Whether to return the router of the best allocator
@@ -92,7 +92,7 @@ def _create_test_env(create_test_env: Any, model: str | None, router: Path | Non
 
 
 # For ``python -m sb3_uav.zoo.enjoy``, with exit codes in place of exceptions.
-main = main_function(PROG, enjoy)
+main = main_function(_PROG, enjoy)
 
 if __name__ == "__main__":
     sys.exit(main())

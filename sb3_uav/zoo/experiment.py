@@ -26,12 +26,12 @@ _SETUP_ERRORS = (
     *(TypeError, AttributeError, AssertionError, ModuleNotFoundError, NameError, SyntaxError, LookupError, ArithmeticError),
     *(RuntimeError, MemoryError),
 )
-OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
+_OUR_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"reinforce": REINFORCE, "ppo_mask": MaskablePPO}
 
 
 def register_algorithms() -> None:
     """Add our algorithms to those of rl_zoo3."""
-    add_algorithms(OUR_ALGORITHMS)
+    add_algorithms(_OUR_ALGORITHMS)
 
 
 def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:

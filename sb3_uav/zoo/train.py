@@ -11,7 +11,7 @@ import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
 from sb3_uav.zoo.dependencies import require_zoo
 
-PROG = "sb3-uav train"
+_PROG = "sb3-uav train"
 
 
 def train(arguments: Sequence[str]) -> None:
@@ -48,7 +48,7 @@ def train(arguments: Sequence[str]) -> None:
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
-    with experiment_manager(UAVExperimentManager), command_line(PROG, ["--algo", known.algo, *defaults, *arguments]):
+    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments]):
         try:
             rl_zoo3.train.train()
         except AssertionError as error:
@@ -61,7 +61,7 @@ def train(arguments: Sequence[str]) -> None:
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.
-main = main_function(PROG, train)
+main = main_function(_PROG, train)
 
 if __name__ == "__main__":
     sys.exit(main())

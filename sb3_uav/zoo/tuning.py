@@ -141,13 +141,13 @@ def _convert_reinforce(params: _Params) -> _Params:
     return {**_convert_powers(params), "baseline_kwargs": None}
 
 
-OUR_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+_OUR_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
     "reinforce": (_sample_reinforce, _convert_reinforce),
     "ppo": (_sample_ppo, _convert_powers),
     "ppo_mask": (_sample_ppo, _convert_powers),
     "a2c": (_sample_a2c, _convert_powers),
 }
-OTHER_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
+_OTHER_SPACES: dict[str, tuple[_Sampler, _Converter]] = {
     "reinforce": (_sample_reinforce_steps, _convert_reinforce),
     "ppo": (sample_ppo_params, convert_onpolicy_params),
     "ppo_mask": (sample_ppo_params, convert_onpolicy_params),
@@ -161,11 +161,11 @@ def register_search_spaces(env_id: str) -> None:
 
     :param env_id: Id of a registered environment
     """
-    for algo, (sampler, converter) in (OUR_SPACES if is_ours(env_id) else OTHER_SPACES).items():
+    for algo, (sampler, converter) in (_OUR_SPACES if _is_ours(env_id) else _OTHER_SPACES).items():
         set_search_space(algo, sampler, converter)
 
 
-def is_ours(env_id: str) -> bool:
+def _is_ours(env_id: str) -> bool:
     """
     :param env_id: Id of a registered environment
     :return: Whether it is one of this package, or a user's subclass of one

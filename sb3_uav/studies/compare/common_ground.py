@@ -19,7 +19,7 @@ from sb3_uav.studies.compare.settings import Settings
 from sb3_uav.studies.compare.variants import router_settings
 from sb3_uav.training.fixed_set_returns import draw_fixed_set, fingerprint
 
-SETTINGS_FILE = "settings.json"
+_SETTINGS_FILE = "settings.json"
 VALIDATION_FILE = "validation.npz"
 ROUTER_FILE = "router.zip"
 
@@ -107,7 +107,7 @@ def check_settings(settings: Settings, needs_router: bool) -> None:
         "device": settings.device,
         "router": file_hash(settings.out / ROUTER_FILE) if needs_router else None,
     }
-    path = settings.out / SETTINGS_FILE
+    path = settings.out / _SETTINGS_FILE
     # A folder without runs restricts nothing.
     if path.is_file() and any((settings.out / "runs").glob("*/seed_*")):
         for key, before in json.loads(path.read_text()).items():

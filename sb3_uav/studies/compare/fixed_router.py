@@ -18,7 +18,7 @@ from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
 
 # What a YAML entry of ITSCallback's router overrides.
-RECIPE: dict[str, Any] = dict(
+_RECIPE: dict[str, Any] = dict(
     policy="RouterPolicy",
     n_envs=64,
     n_samples=8,
@@ -30,7 +30,7 @@ RECIPE: dict[str, Any] = dict(
 
 
 @dataclass(frozen=True)
-class DividedSubsets:
+class _DividedSubsets:
     """
     Single-UAV subsets of instances that are divided without an allocator: half of them at random, as an untrained one does,
     half into sectors around the depot, much as a trained one does.
@@ -71,7 +71,7 @@ def pretrain_router(
     Train a router with REINFORCE and save it.
 
     :param generator: Draws the instances of the fleet
-    :param settings: Overrides of :data:`RECIPE`
+    :param settings: Overrides of :data:`_RECIPE`
     :param n_subsets: Number of training subsets
     :param path: The zip to write
     :param seed: Seed of the training
@@ -79,11 +79,11 @@ def pretrain_router(
     :return: Description of the training, for the report
     :raises ValueError: If the settings do not fit REINFORCE
     """
-    kwargs = {**RECIPE, **settings}
+    kwargs = {**_RECIPE, **settings}
     if kwargs.pop("algo", "reinforce") != "reinforce":
         raise ValueError(f"The router of {settings} is not trained by reinforce; train a router and pass it as --router.")
     n_envs = kwargs.pop("n_envs")
-    env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=DividedSubsets(generator))] * n_envs)
+    env = BatchedVecEnv([lambda: RoutePlanningEnv(generator=_DividedSubsets(generator))] * n_envs)
     try:
         model = REINFORCE(env=env, seed=seed, device=device, **kwargs)
     except TypeError as error:

@@ -23,14 +23,14 @@ from sb3_uav.training.fixed_set_history import EvaluationHistory
 
 CSV_FILE = "evaluations.csv"
 REPORT_FILE = "report.md"
-FIGURE_AXES = {
+_FIGURE_AXES = {
     "timesteps": "environment steps",
     "train_seconds": "seconds of training",
     "cpu_seconds": "CPU seconds of training",
 }
 FIGURE_FILES = ("comparison.png", "comparison.pdf")
-CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
-PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
+_CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
+_PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
 _GRID_POINTS = 200
 
 
@@ -50,7 +50,7 @@ class Run(NamedTuple):
     history: EvaluationHistory
 
 
-class Estimate(NamedTuple):
+class _Estimate(NamedTuple):
     """
     :param mean: The mean
     :param half_width: Half of its 95 % confidence interval; NaN for a single value
@@ -63,7 +63,7 @@ class Estimate(NamedTuple):
         return f"{self.mean:.2f}" if math.isnan(self.half_width) else f"{self.mean:.2f} ± {self.half_width:.2f}"
 
 
-class TableRow(NamedTuple):
+class _TableRow(NamedTuple):
     """
     One variant at one time.
 
@@ -83,9 +83,9 @@ class TableRow(NamedTuple):
     timesteps: float
     seconds: float
     cpu_seconds: float
-    greedy: Estimate
-    sampled: Estimate | None
-    difference: Estimate
+    greedy: _Estimate
+    sampled: _Estimate | None
+    difference: _Estimate
 
 
 def _by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -96,15 +96,15 @@ def _by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {name: [run for run in runs if run.variant == name] for name in dict.fromkeys(run.variant for run in runs)}
 
 
-def estimate(values: np.ndarray) -> Estimate:
+def _estimate(values: np.ndarray) -> _Estimate:
     """
     :param values: ``(n,)``
     :return: Their mean and its confidence interval
     """
-    return Estimate(float(values.mean()), float(confidence_halfwidth(values)))
+    return _Estimate(float(values.mean()), float(confidence_halfwidth(values)))
 
 
-def interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """
     Linear between evaluations, constant before the first and after the last.
 
@@ -121,7 +121,7 @@ def interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray
     return (1 - weight) * values[upper - 1] + weight * values[upper]
 
 
-def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
+def _compute_table(runs: Sequence[Run], axis: str, at: float) -> list[_TableRow]:
     """
     :param runs: Finished runs
     :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
@@ -133,7 +133,7 @@ def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
     def of(run: Run, field: str) -> np.ndarray:
         values = np.asarray(getattr(run.history, field), dtype=np.float64)
         values = values[:, None] if values.ndim == 1 else values
-        return interpolate(getattr(run.history, axis), values, where)[0]
+        return _interpolate(getattr(run.history, axis), values, where)[0]
 
     groups = _by_variant(runs)
     # (n_seeds, n_instances) each.
@@ -143,21 +143,21 @@ def compute_table(runs: Sequence[Run], axis: str, at: float) -> list[TableRow]:
     for name, group in groups.items():
         sampled = np.stack([of(run, "sampled") for run in group])
         rows.append(
-            TableRow(
+            _TableRow(
                 variant=name,
                 n_seeds=len(group),
                 timesteps=float(np.mean([of(run, "timesteps") for run in group])),
                 seconds=float(np.mean([of(run, "train_seconds") for run in group])),
                 cpu_seconds=float(np.mean([of(run, "cpu_seconds") for run in group])),
-                greedy=estimate(greedy[name].mean(1)),
-                sampled=estimate(sampled.mean(1)) if sampled.shape[1] > 0 else None,
-                difference=estimate(greedy[name].mean(0) - greedy[best].mean(0)),
+                greedy=_estimate(greedy[name].mean(1)),
+                sampled=_estimate(sampled.mean(1)) if sampled.shape[1] > 0 else None,
+                difference=_estimate(greedy[name].mean(0) - greedy[best].mean(0)),
             )
         )
     return sorted(rows, key=lambda row: -row.greedy.mean)
 
 
-def compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Band:
+def _compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Band:
     """
     :param group: The runs of one variant
     :param axis: ``"timesteps"``, ``"train_seconds"`` or ``"cpu_seconds"``
@@ -170,12 +170,12 @@ def compute_band(group: Sequence[Run], axis: str, field: str, end: float) -> Ban
     curves = []
     for run in group:
         means = getattr(run.history, field).mean(1)
-        curves.append(interpolate(getattr(run.history, axis), means[:, None], grid)[:, 0])
+        curves.append(_interpolate(getattr(run.history, axis), means[:, None], grid)[:, 0])
     stacked = np.stack(curves)
     return Band(grid, stacked.mean(0), confidence_halfwidth(stacked))
 
 
-def draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None:
+def _draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None:
     """
     :param runs: Finished runs
     :param budget: Environment steps of each
@@ -189,23 +189,23 @@ def draw(runs: Sequence[Run], budget: int, n_samples: int, folder: Path) -> None
     lines = []
     for field, label in fields.items():
         line = []
-        for axis, x_label in FIGURE_AXES.items():
+        for axis, x_label in _FIGURE_AXES.items():
             end = budget if axis == "timesteps" else math.inf
-            bands = {name: compute_band(group, axis, field, end) for name, group in groups.items()}
+            bands = {name: _compute_band(group, axis, field, end) for name, group in groups.items()}
             line.append(BandPanel(x_label, f"mean objective, {label}", bands))
         lines.append(line)
     for name in FIGURE_FILES:
         plot_bands(lines, folder / name)
 
 
-def csv_text(runs: Sequence[Run]) -> str:
+def _csv_text(runs: Sequence[Run]) -> str:
     """
     :param runs: Finished runs
     :return: One row per evaluation
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
+    writer.writerow(_CSV_COLUMNS)
     for run in runs:
         history = run.history
         for i in range(len(history.timesteps)):
@@ -216,7 +216,7 @@ def csv_text(runs: Sequence[Run]) -> str:
     return text.getvalue()
 
 
-def _markdown_table(rows: Sequence[TableRow], n_samples: int) -> str:
+def _markdown_table(rows: Sequence[_TableRow], n_samples: int) -> str:
     """
     :param rows: Rows, the best first
     :param n_samples: Samples per instance
@@ -254,7 +254,7 @@ def machine(n_threads: int, n_jobs: int, device: str) -> str:
 def versions() -> str:
     """:return: Versions of the packages that the figures were made with"""
     found = [f"sb3_uav {sb3_uav.__version__}", f"Python {platform.python_version()}"]
-    for package in PACKAGES:
+    for package in _PACKAGES:
         try:
             found.append(f"{package} {version(package)}")
         except PackageNotFoundError:
@@ -282,8 +282,8 @@ def write_results(
     :param notes: Notes on the procedure, one line each
     :param commands: The commands by description
     """
-    write_atomically(folder / CSV_FILE, csv_text(runs))
-    draw(runs, budget, n_samples, folder)
+    write_atomically(folder / CSV_FILE, _csv_text(runs))
+    _draw(runs, budget, n_samples, folder)
     wall, cpu = (min(float(getattr(run.history, axis)[-1]) for run in runs) for axis in ("train_seconds", "cpu_seconds"))
     lines = [
         f"# {title}",
@@ -296,19 +296,19 @@ def write_results(
         "",
         f"## At equal environment steps: {budget:,}",
         "",
-        _markdown_table(compute_table(runs, "timesteps", budget), n_samples),
+        _markdown_table(_compute_table(runs, "timesteps", budget), n_samples),
         "",
         f"## At equal wall time: {wall:,.1f} s of training",
         "",
         "The time of the fastest run.",
         "",
-        _markdown_table(compute_table(runs, "train_seconds", wall), n_samples),
+        _markdown_table(_compute_table(runs, "train_seconds", wall), n_samples),
         "",
         f"## At equal CPU time: {cpu:,.1f} s of training",
         "",
         "Other processes on the machine lengthen wall time, by a different factor in each run; they hardly change CPU time.",
         "",
-        _markdown_table(compute_table(runs, "cpu_seconds", cpu), n_samples),
+        _markdown_table(_compute_table(runs, "cpu_seconds", cpu), n_samples),
         "",
         "## How to read this",
         "",

@@ -19,7 +19,7 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory
 
 FINISHED_FILE = "finished.json"
-LOG_FILE = "train.log"
+_LOG_FILE = "train.log"
 
 
 class ZooTraining(NamedTuple):
@@ -74,7 +74,7 @@ class ZooTraining(NamedTuple):
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True)
         environment = {**os.environ, "OMP_NUM_THREADS": str(self.n_threads)}
-        with (self.folder / LOG_FILE).open("wb") as log:
+        with (self.folder / _LOG_FILE).open("wb") as log:
             # In its own session, because rl_zoo3 treats Ctrl-C as a normal end of training.
             return subprocess.Popen(
                 [sys.executable, *self.flags],
@@ -92,7 +92,7 @@ class ZooTraining(NamedTuple):
         :param seconds: Wall time of its process
         :return: What went wrong, or None if the run is complete
         """
-        log = self.folder / LOG_FILE
+        log = self.folder / _LOG_FILE
         if exit_code != 0:
             lines = log.read_text(errors="replace").strip().splitlines()
             return f"{log}: {lines[-1] if lines else f'exit code {exit_code}'}"

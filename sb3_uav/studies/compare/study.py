@@ -50,13 +50,13 @@ def run_study(settings: Settings, arguments: Sequence[str], report_only: bool = 
     if needs_router:
         make_router(settings, problem)
     check_settings(settings, needs_router)
-    trainings = _plan_trainings([with_common_ground(variant, settings, needs_router) for variant in variants], settings)
+    trainings = _plan_trainings([_with_common_ground(variant, settings, needs_router) for variant in variants], settings)
     if not report_only:
         train_all([training for training in trainings if not training.is_finished], settings.jobs)
     return _write_report(settings, arguments, [training for training in trainings if training.is_finished])
 
 
-def with_common_ground(variant: Variant, settings: Settings, needs_router: bool) -> Variant:
+def _with_common_ground(variant: Variant, settings: Settings, needs_router: bool) -> Variant:
     """
     Give an entry the common budget, evaluation and router.
 
