@@ -20,7 +20,8 @@ BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard ben
 
 install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
 
-# torch comes first and alone: without its pin pip may fetch several gigabytes of another build.
+# torch comes first and alone, so that PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu can choose the small build
+# without CUDA, and a build that is installed already is kept.
 $(INSTALLED): setup.cfg pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_CONSTRAINTS) torch

@@ -280,10 +280,10 @@ np.savez({str(target / "evaluations.npz")!r}, timesteps=[0, steps], results=one,
         return ["-c", script]
 
 
-def fake(folder: Path, behaviour: str = "", steps: int = 100, seed: int = 0) -> Fake:
+def fake(folder: Path, behavior: str = "", steps: int = 100, seed: int = 0) -> Fake:
     folder.mkdir(parents=True, exist_ok=True)
-    config = folder / f"behaviour_{seed}.py"
-    config.write_text(f"steps = {steps}\n{behaviour}")
+    config = folder / f"behavior_{seed}.py"
+    config.write_text(f"steps = {steps}\n{behavior}")
     return Fake("A", "ppo", ROUTING, seed, 100, config, folder / f"seed_{seed}")
 
 
@@ -298,7 +298,7 @@ def test_finished_runs_are_marked_and_others_start_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "steps", "message"),
+    ("behavior", "steps", "message"),
     [
         ("sys.exit('no such key')", 100, r"train\.log: no such key"),
         ("os._exit(3)", 100, r"train\.log: exit code 3"),
@@ -306,8 +306,8 @@ def test_finished_runs_are_marked_and_others_start_again(tmp_path):
         ("", 60, "stopped after 60 of 100 steps"),
     ],
 )
-def test_failed_runs_are_named_after_the_others_are_through(behaviour, steps, message, tmp_path):
-    bad, good = fake(tmp_path, behaviour, steps), fake(tmp_path, seed=1)
+def test_failed_runs_are_named_after_the_others_are_through(behavior, steps, message, tmp_path):
+    bad, good = fake(tmp_path, behavior, steps), fake(tmp_path, seed=1)
     with pytest.raises(ValueError, match=f"1 of 2 trainings failed: .*{message}"):
         train_all([bad, good], 1)
     assert good.is_finished and not bad.is_finished

@@ -190,7 +190,7 @@ def test_step_loop_on_the_device(level: str, device: str) -> None:
 @devices
 @presets
 def test_its_trains_both_levels_on_the_device(preset: str, device: str, tmp_path: Path) -> None:
-    """Pre-training, intensive and alternate training; the checkpoint goes on on the CPU."""
+    """Pre-training, intensive and alternate training; the checkpoint resumes on the CPU."""
     router: dict[str, Any] = dict(
         policy="RouterPolicy",
         n_envs=N_ENVS,
@@ -217,10 +217,10 @@ def test_its_trains_both_levels_on_the_device(preset: str, device: str, tmp_path
     for policy, level in zip(policies, ("allocator", "router"), strict=True):
         assert_equal_states(policy.state_dict(), load_policy(folder / state[level], device="cpu").state_dict())
     resumed = REINFORCE.load(folder / state["allocator"], env=make_env("allocator"), device="cpu")
-    going_on = ITSCallback(router, n_epochs=3, save_path=str(tmp_path), resume_from=str(folder), **schedule)
-    resumed.learn(10**9, callback=going_on, reset_num_timesteps=False)
-    assert len(going_on.records) == 7 and resumed.epoch == 3
-    assert_on(going_on.router.policy, "cpu")
+    resumed_its = ITSCallback(router, n_epochs=3, save_path=str(tmp_path), resume_from=str(folder), **schedule)
+    resumed.learn(10**9, callback=resumed_its, reset_num_timesteps=False)
+    assert len(resumed_its.records) == 7 and resumed.epoch == 3
+    assert_on(resumed_its.router.policy, "cpu")
 
 
 # -------------------------------------------------------------------------------------------------------------- solvers

@@ -22,7 +22,7 @@ from sb3_uav.solvers import SOLVERS
 # ------------------------------------------------------------------------------------------- interruptions and other troubles
 
 
-def test_going_on_after_ctrl_c(
+def test_resuming_after_ctrl_c(
     inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Results stay; the same command resumes, and --overwrite starts over."""

@@ -22,7 +22,7 @@ from sb3_uav.solvers import Solver, make_solver
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit()])
-def test_going_on_after_an_interruption(error: BaseException, instances: Instances, tmp_path: Path) -> None:
+def test_resuming_after_an_interruption(error: BaseException, instances: Instances, tmp_path: Path) -> None:
     """What was found before Ctrl-C is there; then only the rest is solved, and the files are those of an undisturbed run."""
     sets = {"a": instances[:3], "b": instances[3:]}
     undisturbed = evaluate([Stub(), Nearest()], sets, tmp_path / "whole", seed=1)
@@ -60,7 +60,7 @@ def test_a_later_crash_takes_the_old_summary_away(instances: Instances, tmp_path
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_going_on_after_a_crash_at_any_byte(data: st.DataObject, instances: Instances, tmp_path: Path) -> None:
+def test_resuming_after_a_crash_at_any_byte(data: st.DataObject, instances: Instances, tmp_path: Path) -> None:
     """Whatever part of the two files reached the disk, the end is the same, and no whole result is thrown away."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     if not whole.exists():
@@ -106,7 +106,7 @@ def test_folders_grow(instances: Instances, tmp_path: Path) -> None:
     assert [row["seed"] for row in read_rows(folder)].count("1") == 3
     assert all(line in contents(folder)[0] for line in before[0].splitlines())
     assert len(json.loads((folder / "evaluation.json").read_text())["runs"]) == 4
-    # One seed at a time is summarised.
+    # One seed at a time is summarized.
     assert evaluate([solver], {"a": first}, folder, resume=True)[0].n_instances == 3
 
 

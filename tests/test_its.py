@@ -160,7 +160,7 @@ def test_pretraining_leaves_the_allocator_alone():
     assert not equal(start, model.policy.state_dict())
 
 
-def test_models_can_go_on_learning_afterwards():
+def test_models_can_continue_learning_afterwards():
     """Neither a limit nor frozen parameters stay behind."""
     model, its = make_allocator(), make_its(n_epochs=2)
     learn(model, its)

@@ -80,7 +80,7 @@ def test_zip_of_every_algorithm(algorithm: type[BaseAlgorithm], tmp_path: Path) 
 
 
 @pytest.mark.parametrize("policy_kwargs", [dict(TINY, preset="paper"), dict(TINY, net_arch=dict(pi=[8], vf=[4]))])
-def test_plain_policy_kwargs_are_honoured(policy_kwargs: dict[str, Any], tmp_path: Path) -> None:
+def test_plain_policy_kwargs_are_honored(policy_kwargs: dict[str, Any], tmp_path: Path) -> None:
     model = make_model(REINFORCE, policy_kwargs=policy_kwargs)
     model.save(tmp_path / "model.zip")
     policy = load_policy(tmp_path / "model.zip", "cpu")

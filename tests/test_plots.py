@@ -42,7 +42,7 @@ def log(tmp_path: Path) -> Path:
     return path
 
 
-def colours_in(path: Path) -> set[str]:
+def colors_in(path: Path) -> set[str]:
     red, green, blue = np.moveaxis((matplotlib.image.imread(path)[..., :3] * 255).round().astype(np.int64), -1, 0)
     return {f"#{number:06X}" for number in np.unique(red << 16 | green << 8 | blue)}
 
@@ -56,13 +56,13 @@ def only_file_in(folder: Path) -> Path:
 
 
 def test_map_of_a_schedule(instances: Instances, tmp_path: Path) -> None:
-    """The picture is whole, and shows the colours of the UAVs that fly, and of no other."""
+    """The picture is whole, and shows the colors of the UAVs that fly, and of no other."""
     plot_schedule(instances, 1, Schedule([[0, 1, 2], [3, 4]]), tmp_path / "new" / "map.png", "two of three UAVs")
     path = only_file_in(tmp_path / "new")
     height, width = matplotlib.image.imread(path).shape[:2]
     assert width > 600 and height > 700
-    assert set(UAV_COLORS[:2]) <= colours_in(path)
-    assert UAV_COLORS[2] not in colours_in(path)
+    assert set(UAV_COLORS[:2]) <= colors_in(path)
+    assert UAV_COLORS[2] not in colors_in(path)
 
 
 def test_legend_and_extent_of_a_map(instances: Instances) -> None:

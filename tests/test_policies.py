@@ -156,7 +156,7 @@ def test_subset_context_is_the_running_maximum():
 
 
 def test_a_masked_action_is_never_drawn():
-    """10^5 draws, with logits that favour the illegal actions by far."""
+    """10^5 draws, with logits that favor the illegal actions by far."""
     logits = th.tensor([5.0, 60.0, -3.0, 80.0, 0.0]).expand(100_000, 5)
     mask = th.tensor([True, False, True, False, True])
     drawn = sample_actions(logits.masked_fill(~mask, -th.inf), False, th.Generator().manual_seed(0))

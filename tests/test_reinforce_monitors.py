@@ -113,7 +113,7 @@ def test_environments_without_monitor_files_need_none():
         assert make_model("router", env=env).learn_instances(4).n_batches > 0
 
 
-def test_time_steps_of_a_resumed_run_go_on_where_they_were(tmp_path):
+def test_time_steps_of_a_resumed_run_continue(tmp_path):
     """How far num_timesteps is ahead of the episodes is part of the zip."""
     unbroken = make_model("router").learn_instances(40)
     broken = make_model("router").learn_instances(20)

@@ -119,7 +119,7 @@ def test_pictures_have_content(out: Path) -> None:
     for name in ("fig3", "fig4", "fig5", "fig6", "fig7"):
         picture = matplotlib.image.imread(out / f"{name}.png")[..., :3]
         assert picture.shape[0] > 500 and picture.shape[1] > 1000, name
-        # Coloured lines, not an empty frame.
+        # Colored lines, not an empty frame.
         assert ((picture.max(-1) - picture.min(-1)) > 0.3).mean() > 0.001, name
         with Image.open(out / f"{name}.png") as image:
             assert "Seed: 0" in image.info["Description"], name
@@ -295,18 +295,18 @@ def test_own_pairs(out: Path, tmp_path: Path, threads: None, capsys: pytest.Capt
 
 
 @pytest.mark.slow
-def test_a_licence_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_license_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The solver is left out of the table, which says why."""
 
-    def no_licence(spec: str, **_: Any) -> Any:
-        raise ValueError(f"{spec}: no licence")
+    def no_license(spec: str, **_: Any) -> Any:
+        raise ValueError(f"{spec}: no license")
 
-    monkeypatch.setattr("sb3_uav.reproduce.evaluator.make_solver", no_licence)
+    monkeypatch.setattr("sb3_uav.reproduce.evaluator.make_solver", no_license)
     arguments = ("--scale", "smoke", "--no-training", "--solvers", "milp", "--exact-backend", "gurobi", "--out", tmp_path)
     assert run("table2", *arguments) == 0
     _, rows, comments = read_table(tmp_path / "table2.csv")
     assert {row["30 instances: Gurobi (1800s)"] for row in rows if row["Source"] == "ours"} == {""}
-    expected = "# U4-80: milp with gurobi (1 s): milp:time_limit=1,backend=gurobi: no licence\n"
+    expected = "# U4-80: milp with gurobi (1 s): milp:time_limit=1,backend=gurobi: no license\n"
     assert expected in comments and "solved by gurobi" in "".join(comments)
 
 

@@ -173,7 +173,7 @@ def test_both_levels_train(allocation):
 
 
 @pytest.mark.slow
-def test_both_levels_go_on(folder, allocation):
+def test_both_levels_continue(folder, allocation):
     """Stock rl_zoo3 does not tell the callback where the router is; the allocator's zip does."""
     zoo(
         *("train", folder, "--env", ALLOCATION, "--gym-packages", "sb3_uav.zoo.batched", "--conf-file", str(config())),

@@ -109,9 +109,9 @@ class Spy(TrialEvalCallback):
 
     def _on_step(self) -> bool:
         n_done = len(self.evaluations_results)
-        going_on = super()._on_step()
+        continuing = super()._on_step()
         self.means += [float(np.mean(results)) for results in self.evaluations_results[n_done:]]
-        return going_on
+        return continuing
 
 
 @pytest.fixture
@@ -197,7 +197,7 @@ def test_both_levels_in_a_trial(tmp_path, evaluations, algo):
 @pytest.mark.parametrize(
     ("algo", "message"),
     [
-        # The fused driver goes on with NaN; our callback stops it.
+        # The fused driver would continue with NaN; our callback stops it.
         ("reinforce", "Training diverged: features_extractor.encoder.embed_depot.weight is not finite after"),
         ("ppo", "Expected parameter logits"),
     ],

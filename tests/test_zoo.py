@@ -204,7 +204,7 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("normalize", [{"norm_obs": False, "norm_reward": True}])
-def test_zoo_keys_are_honoured(tmp_path, normalize):
+def test_zoo_keys_are_honored(tmp_path, normalize):
     """Wrappers, schedules, and numbers that YAML takes for text."""
     its_free = dict(callback=None, n_steps=20, n_timesteps=4 * 20 * 2, learning_rate="lin_1e-3", ent_coef="1e-2")
     config = write_config(tmp_path, normalize=normalize, monitor_kwargs={}, **its_free)

@@ -11,6 +11,8 @@ from sb3_uav.common.optional import require
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id
 from sb3_uav.zoo.dependencies import require_zoo
 
+_DESCRIPTION = "Train a small scenario through all phases of ITS, evaluate the pair beside heuristics, and draw figures."
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
@@ -22,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that the demo needs is not installed
     """
-    parser = argparse.ArgumentParser(prog="sb3-uav demo", description=__doc__)
+    parser = argparse.ArgumentParser(prog="sb3-uav demo", description=_DESCRIPTION)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder of all results (default: %(default)s)")
     parser.add_argument("--env", default=allocation_id(DEMO_FLEET, DEMO_SIZE), help="default: %(default)s")
     parser.add_argument("--n-instances", type=int, default=200, help="test instances (default: %(default)s)")

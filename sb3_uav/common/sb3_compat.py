@@ -18,7 +18,7 @@ def linear_schedule(start: float) -> Schedule:
     A schedule that falls linearly from ``start`` to 0 over the whole training.
 
     ``LinearSchedule``, which SB3 2.6 has not, in place of ``get_linear_fn``, which it deprecates:
-    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/utils.py
+    https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/utils.py#L107
 
     :param start: Value at the beginning
     :return: A function of the progress that remains, 1 to 0
@@ -32,7 +32,7 @@ def n_updates(model: BaseAlgorithm) -> int:
     """
     Number of updates so far; PPO counts its epochs over a rollout, A2C and REINFORCE their optimizer steps.
 
-    ``self._n_updates`` in https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+    ``self._n_updates``: https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L161
 
     :param model: Any SB3 algorithm
     :return: Its number of updates, kept in its zip
@@ -44,7 +44,7 @@ def total_timesteps(model: BaseAlgorithm) -> int:
     """
     Number of steps at which the running ``learn`` stops.
 
-    ``_setup_learn`` in https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+    ``_setup_learn``: https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L417
 
     :param model: Any SB3 algorithm
     :return: Its ``total_timesteps``, earlier calls of ``learn`` included; 0 before the first
@@ -57,7 +57,7 @@ def set_last_observation(model: OnPolicyAlgorithm, observation: np.ndarray | dic
     Continue from the first observation of an environment that was reset by other code than the algorithm.
 
     ``_setup_learn`` does the same after its own reset:
-    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+    https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L423
 
     :param model: An on-policy algorithm
     :param observation: The observation that ``reset`` of its environment returned
@@ -71,7 +71,7 @@ def forget_last_observation(model: OnPolicyAlgorithm) -> None:
     Make the next ``learn`` reset the environment, even with ``reset_num_timesteps=False``.
 
     ``set_env`` with ``force_reset`` does the same:
-    https://github.com/DLR-RM/stable-baselines3/blob/master/stable_baselines3/common/base_class.py
+    https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L506
 
     :param model: An on-policy algorithm
     """

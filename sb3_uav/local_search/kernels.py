@@ -149,7 +149,7 @@ def measure(plan, v):
 
 @njit(cache=True, nogil=True)
 def measure_all(plan):
-    """Find out from the routes who visits what, and how long the tours are."""
+    """Compute from the routes which UAV visits each task, and how long the tours are."""
     for task in range(len(plan.nodes)):
         plan.nodes[task].owner = -1
     for v in range(len(plan.tours)):

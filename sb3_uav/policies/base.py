@@ -121,6 +121,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
             optimizer_kwargs=optimizer_kwargs,
         )
 
+    # https://github.com/Stable-Baselines-Team/stable-baselines3-contrib/blob/v2.9.2/sb3_contrib/common/maskable/policies.py#L169
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         for key in ("features_extractor_class", "features_extractor_kwargs", "normalize_images", "squash_output"):
@@ -158,6 +159,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
 
     # ---------------------------------------------------------------------------------------------------- heads
 
+    # https://github.com/Stable-Baselines-Team/stable-baselines3-contrib/blob/v2.9.2/sb3_contrib/common/maskable/policies.py#L186
     def _build_mlp_extractor(self) -> None:
         # Where features begin with logits, whose number varies, only what follows is input of the critic's layers.
         features_dim = self.features_dim
@@ -165,6 +167,7 @@ class EpisodicPolicy(MaskableActorCriticPolicy):
         super()._build_mlp_extractor()
         self.features_dim = features_dim
 
+    # https://github.com/Stable-Baselines-Team/stable-baselines3-contrib/blob/v2.9.2/sb3_contrib/common/maskable/policies.py#L201
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         if self.features_extractor.context_dim is not None:

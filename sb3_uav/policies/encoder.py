@@ -76,11 +76,7 @@ class _NodeNorm(nn.Module):
             self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, nodes: th.Tensor, node_mask: th.Tensor | None) -> th.Tensor:
-        """
-        :param nodes: ``(batch, n_nodes, embed_dim)``
-        :param node_mask: ``(batch, n_nodes)`` bool, or None when all are real
-        :return: ``(batch, n_nodes, embed_dim)``
-        """
+        """Parameters and result as of :meth:`_InstanceNorm.forward`."""
         if isinstance(self.norm, _InstanceNorm):
             return self.norm(nodes, node_mask)
         if not isinstance(self.norm, nn.BatchNorm1d):

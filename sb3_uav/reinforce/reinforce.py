@@ -164,6 +164,7 @@ class REINFORCE(OnPolicyAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
+    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/on_policy_algorithm.py#L115
     def _setup_model(self) -> None:
         for name in ("n_samples", "instances_per_epoch", "n_steps"):
             value = getattr(self, name)
@@ -369,6 +370,7 @@ class REINFORCE(OnPolicyAlgorithm):
             loss = loss + self.vf_coef * value_loss
         return loss
 
+    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L287
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
@@ -433,9 +435,11 @@ class REINFORCE(OnPolicyAlgorithm):
     ) -> None:
         save_atomically(self, path, exclude, include)
 
+    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L303
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_baseline", "baseline_policy", "_batch", "max_instances"]
 
+    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/on_policy_algorithm.py#L343
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         if self.baseline == "rollout":

@@ -19,7 +19,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Until release 0.1 these stood here. The one place where a lower room looks into a higher one: old scripts keep running.
+    # These names were here in release 0.1. This is the only import of a higher folder, so that old scripts keep running.
     if name in ("SummaryRow", "evaluate", "print_table"):
         from sb3_uav import evaluation
 

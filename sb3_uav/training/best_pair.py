@@ -31,7 +31,7 @@ class BestPair:
     :func:`find_best_router` finds the router of ``best_model.zip`` even if the process ends between the two renames.
 
     :param folder: The folder
-    :param copies: Names of files that get the bytes of ``best_model.zip`` too
+    :param copies: Names of files that get the bytes of ``best_model.zip`` too, after both renames
     """
 
     def __init__(self, folder: Path, copies: tuple[str, ...] = ()) -> None:
@@ -108,7 +108,7 @@ def find_best_router(folder: Path) -> Path | None:
                 if path.is_file() and file_hash(path) == note["router"]:
                     return path
     except (OSError, ValueError, LookupError, TypeError):
-        # A folder of an earlier version, or files that somebody has put there: the names decide.
+        # A folder of an earlier version, or files put there by hand: the names decide.
         pass
     return plain if plain.is_file() else None
 

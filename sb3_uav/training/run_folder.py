@@ -31,7 +31,7 @@ def find_run_folder(callback: BaseCallback) -> Path | None:
     monitor = _monitor_folder(callback.training_env.unwrapped)
     if monitor is not None:
         return monitor
-    # Without output files, SB3's logger names a temporary folder, where nobody would look for zips.
+    # Without output files, SB3's logger has a temporary folder, which is no place for zips.
     logger = callback.logger
     if logger.dir and any(not isinstance(output, HumanOutputFormat) for output in logger.output_formats):
         return Path(logger.dir)

@@ -50,7 +50,7 @@ def make_batched_vec_env(env_fns: list[Any]) -> VecEnv:
 class UAVExperimentManager(ExperimentManager):
     """
     rl_zoo3's experiment manager, with our vectorized environment and without these traps of rl_zoo3 2.9.2
-    (https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/exp_manager.py):
+    (https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L443):
 
     - ``env_kwargs`` of a YAML reach the evaluation environment too;
     - ``const_X`` is a constant, and numbers that YAML reads as strings (``1e-3``) are numbers;
@@ -109,6 +109,7 @@ class UAVExperimentManager(ExperimentManager):
             env.seed(self.seed + EVALUATION_SEED)
         return env
 
+    # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L443
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         try:
             processed = super()._preprocess_hyperparams(hyperparams)
@@ -136,6 +137,7 @@ class UAVExperimentManager(ExperimentManager):
         elif n_tasks and "instances_per_epoch" in hyperparams:
             self.eval_freq = hyperparams["instances_per_epoch"] * hyperparams.get("n_samples", 1) * n_tasks
 
+    # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L401
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
         for key in ("learning_rate", "clip_range", "clip_range_vf", "delta_std", "ent_coef"):

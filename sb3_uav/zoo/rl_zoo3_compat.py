@@ -49,8 +49,8 @@ def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
     """
     Set the command line that ``rl_zoo3.train`` and ``rl_zoo3.enjoy`` parse, because they take no arguments.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``parser.parse_args()``)
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (the same)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/train.py#L168
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/enjoy.py (the same call)
 
     :param prog: Name of the command
     :param arguments: Its arguments
@@ -64,7 +64,7 @@ def experiment_manager(manager: type[ExperimentManager]) -> Iterator[None]:
     """
     Replace the experiment manager that ``rl_zoo3.train`` looks up in its module.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/train.py (``exp_manager = ExperimentManager(``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/train.py#L233
 
     :param manager: The class
     """
@@ -77,7 +77,7 @@ def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
     """
     Replace the function that ``rl_zoo3.enjoy`` looks up in its module to make its environment.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/enjoy.py (``env = create_test_env(``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/enjoy.py#L164
 
     :param make: Takes the arguments of ``rl_zoo3.utils.create_test_env``
     """
@@ -103,7 +103,7 @@ def set_default_vec_env(make: _MakeVecEnv) -> None:
     """
     Replace rl_zoo3's default vectorized environment.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/exp_manager.py (``default_vec_env_cls``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L139
 
     :param make: Takes one function per row
     """
@@ -114,7 +114,7 @@ def add_algorithms(algorithms: dict[str, type[BaseAlgorithm]]) -> None:
     """
     Add to the algorithms of rl_zoo3; ``train``, ``enjoy`` and the experiment manager share one dict.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/utils.py (``ALGOS``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/utils.py#L27
 
     :param algorithms: Classes by the names that ``--algo`` takes
     """
@@ -125,7 +125,7 @@ def set_search_space(algo: str, sampler: Callable[..., Any], converter: Callable
     """
     Replace the search space of ``-optimize``.
 
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/master/rl_zoo3/hyperparams_opt.py (``HYPERPARAMS_SAMPLER``)
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/hyperparams_opt.py#L492
 
     :param algo: Name of an algorithm
     :param sampler: Draws hyperparameters
