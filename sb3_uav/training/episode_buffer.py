@@ -138,7 +138,7 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
         self._static = {key: [np.concatenate(rows)[began]] for key, rows in self._static.items()}
         self.generator_ready = True
 
-    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/buffers.py, DictRolloutBuffer._get_samples
+    # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/buffers.py#L831
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         samples = super()._get_samples(batch_inds, env)
         fragments, index = np.unique(self._fragments[batch_inds], return_inverse=True)
