@@ -91,8 +91,8 @@ def test_an_interrupted_imitation_goes_on(
         expected = learned(None)
     n_all = searches.call_count
     with monkeypatch.context() as patch:
-        counts = {"good_tours": n_searched, "varied": n_updated}
-        for name, function in (("good_tours", good_tours), ("varied", _varied)):
+        counts = {"good_tours": n_searched, "_varied": n_updated}
+        for name, function in (("good_tours", good_tours), ("_varied", _varied)):
 
             def interrupted(*args: Any, name: str = name, function: Any = function) -> Any:
                 counts[name] -= 1

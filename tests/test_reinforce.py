@@ -70,7 +70,7 @@ def test_allocator_learns_to_split():
         return problem.returns(test, model.policy.decode_episodes(test)).mean().item()
 
     untrained = objective()
-    model.learn_instances(64 * 80)
+    model.learn_instances(64 * 120)
     random_split = problem.returns(test, th.randint(2, (300, 1, 8), generator=th.Generator().manual_seed(0))).mean().item()
     assert objective() > max(untrained, random_split) + 0.25
 

@@ -73,7 +73,9 @@ def test_the_router_may_have_its_own_seed(tmp_path):
 
 @pytest.mark.parametrize("algo", ["reinforce", "ppo", "ppo_mask", "a2c"])
 def test_seed_device_and_verbose_are_accepted(algo):
-    its = make_its(dict(algo=algo, seed=3, device="cpu", verbose=0), n_epochs=1, n_pretraining_epochs=1)
+    # PPO's default rollouts have 2,048 steps.
+    rollout = dict(n_steps=16, batch_size=16) if algo.startswith("ppo") else {}
+    its = make_its(dict(algo=algo, seed=3, device="cpu", verbose=0, **rollout), n_epochs=1, n_pretraining_epochs=1)
     learn(make_allocator(), its)
     assert its.router.seed == 3 and its.router.device == th.device("cpu")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, TimeLimit
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
@@ -19,6 +19,9 @@ from sb3_uav.envs.problem import Problem
 
 # Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
 _TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
+# By name, because importing rl_zoo3 puts its own class in the place of Gymnasium's:
+# https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/gym_patches.py
+_TIME_LIMITS = ("TimeLimit", "PatchedTimeLimit")
 
 
 def strip_wrappers(env: gym.Env) -> gym.Env:
@@ -28,7 +31,7 @@ def strip_wrappers(env: gym.Env) -> gym.Env:
     """
     inner: Any = env
     # Only exact types: a subclass may behave differently.
-    while type(inner) in _TRANSPARENT_WRAPPERS or (type(inner) is TimeLimit and not _can_cut_off(inner)):
+    while type(inner) in _TRANSPARENT_WRAPPERS or _is_loose_limit(inner):
         inner = inner.env
     return inner
 
@@ -46,12 +49,14 @@ def find_monitor(env: gym.Env) -> Monitor | None:
     return None
 
 
-def _can_cut_off(limit: TimeLimit) -> bool:
-    """Whether an episode inside may be longer than the limit; True if there is no telling."""
-    n_steps = None if limit.spec is None else limit.spec.max_episode_steps
-    inner = limit.unwrapped
+def _is_loose_limit(env: gym.Env) -> bool:
+    """Whether this is a time limit that no episode inside reaches; False if there is no telling."""
+    if not isinstance(env, gym.Wrapper) or type(env).__name__ not in _TIME_LIMITS:
+        return False
+    n_steps = None if env.spec is None else env.spec.max_episode_steps
+    inner = env.unwrapped
     # The router's tours visit every task and the depot at most; the allocator takes one step fewer.
-    return n_steps is None or not isinstance(inner, ProblemEnv) or n_steps < inner.problem.generator.n_tasks + 1
+    return n_steps is not None and isinstance(inner, ProblemEnv) and n_steps >= inner.problem.generator.n_tasks + 1
 
 
 def unwrap_problem_env(env: gym.Env) -> ProblemEnv | None:
