@@ -66,6 +66,7 @@ class UAVExperimentManager(ExperimentManager):
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
+        self._eval_env_kwargs_given = getattr(args, "eval_env_kwargs", None) is not None
         if kwargs.get("vec_env_type", "dummy") == "dummy":
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
         register_search_spaces(self.env_name.gym_id)
@@ -117,7 +118,7 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self._where}: an argument of 'callback' does not fit: {error}") from error
         if not isinstance(hyperparams.get("policy_kwargs") or {}, dict):
             raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
-        if self._eval_env_kwargs_args is None:
+        if not self._eval_env_kwargs_given:
             self.eval_env_kwargs = self.env_kwargs
         if not self.eval_freq_given:
             self._choose_eval_freq(hyperparams, processed[2])
@@ -186,7 +187,8 @@ class UAVExperimentManager(ExperimentManager):
 
 def _described(error: Exception) -> str:
     """The message of an error, with its type where the text alone is unclear."""
-    return str(error) if isinstance(error, TypeError | AssertionError | ImportError) else f"{type(error).__name__}: {error}"
+    clear = isinstance(error, TypeError | AssertionError | ImportError) and str(error)
+    return str(error) if clear else f"{type(error).__name__}: {error}"
 
 
 def _is_fixed_set_evaluation(entry: Any) -> bool:
