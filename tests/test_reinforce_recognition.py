@@ -87,6 +87,11 @@ def test_harmless_vectorized_wrappers_leave_the_fused_driver():
             [lambda: TimeLimit(gym.make("RoutePlanning-N20-v0"), 20)],
             "the wrapper (Patched)?TimeLimit may change observations or rewards",
         ),
+        (
+            # Another class of the same name may do anything.
+            [lambda: type("TimeLimit", (TimeLimit,), {})(RoutePlanningEnv(6), 100)],
+            "the wrapper TimeLimit may change observations or rewards",
+        ),
         ([lambda: DoubledReward(6)] * 2, "DoubledReward overrides step or reset"),
         ([lambda: gym.make("CartPole-v1")], "is not an environment of sb3_uav"),
         (

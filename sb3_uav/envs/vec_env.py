@@ -21,7 +21,7 @@ from sb3_uav.envs.problem import Problem
 _TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
 # By name, because importing rl_zoo3 puts its own class in the place of Gymnasium's:
 # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/gym_patches.py
-_TIME_LIMITS = ("TimeLimit", "PatchedTimeLimit")
+_TIME_LIMITS = ("gymnasium.wrappers.common.TimeLimit", "rl_zoo3.gym_patches.PatchedTimeLimit")
 
 
 def strip_wrappers(env: gym.Env) -> gym.Env:
@@ -51,7 +51,7 @@ def find_monitor(env: gym.Env) -> Monitor | None:
 
 def _is_loose_limit(env: gym.Env) -> bool:
     """Whether this is a time limit that no episode inside reaches; False if there is no telling."""
-    if not isinstance(env, gym.Wrapper) or type(env).__name__ not in _TIME_LIMITS:
+    if not isinstance(env, gym.Wrapper) or f"{type(env).__module__}.{type(env).__qualname__}" not in _TIME_LIMITS:
         return False
     n_steps = None if env.spec is None else env.spec.max_episode_steps
     inner = env.unwrapped

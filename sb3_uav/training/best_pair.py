@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -117,9 +118,9 @@ class RouterCallback(BaseCallback):
     """A callback that trains a router beside the allocator."""
 
     @property
+    @abstractmethod
     def router(self) -> BaseAlgorithm:
         """The router's algorithm."""
-        raise NotImplementedError
 
     def _on_step(self) -> bool:
         return True
@@ -129,9 +130,9 @@ class BestPairOwner(BaseCallback):
     """A callback whose evaluation decides which pair of a folder is the best."""
 
     @property
+    @abstractmethod
     def owned_folder(self) -> Path | None:
         """The folder of its best pair; None if it leaves that to another callback."""
-        raise NotImplementedError
 
     def _on_step(self) -> bool:
         return True
@@ -151,9 +152,11 @@ class _SaveEvaluatedPair(BaseCallback):
     def _on_step(self) -> bool:
         evaluation = self.parent
         assert isinstance(evaluation, EvalCallback)
-        owned = [owner.owned_folder for owner in siblings(evaluation, BestPairOwner)]
+        # Abstract classes: https://github.com/python/mypy/issues/4717
+        owners = siblings(evaluation, BestPairOwner)  # type: ignore[type-abstract]
+        owned = [owner.owned_folder for owner in owners]
         if not any(folder is not None and folder.resolve() == self.folder.resolve() for folder in owned):
-            training = siblings(evaluation, RouterCallback)
+            training = siblings(evaluation, RouterCallback)  # type: ignore[type-abstract]
             about = {"timesteps": self.model.num_timesteps, "mean_reward": evaluation.last_mean_reward}
             router = training[0].router if training else None
             BestPair(self.folder).save(self.model, router, evaluated_by=type(evaluation).__name__, **about)
