@@ -83,7 +83,8 @@ def test_share_of_the_imitation(monkeypatch):
     """The share cuts both the tours and the updates."""
     pytest.importorskip("numba")
     lines: list[str] = []
-    router, allocator = (cls(*cls.placeholder_spaces(2), lambda _: 0.0, **SMALL) for cls in (RouterPolicy, AllocatorPolicy))
+    router = RouterPolicy(*RouterPolicy.placeholder_spaces(2), lambda _: 0.0, **SMALL)
+    allocator = AllocatorPolicy(*AllocatorPolicy.placeholder_spaces(2), lambda _: 0.0, **SMALL)
     generator = UniformGenerator(n_tasks=6, n_uavs=2)
     imitate(router, allocator, generator, np.random.default_rng(0), 400, 300, batch_size=4, report=lines.append, share=0.01)
     assert lines[-1].startswith("imitation: 3 of 3 updates") and " of 4 tours" in lines[0]
