@@ -327,7 +327,7 @@ def test_texts_become_numbers():
 def test_shipped_small_entries_build(name):
     import gymnasium as gym
 
-    settings = dict(shipped()[name])
+    settings = dict(shipped("reinforce")[name])
     for key in ("callback", "n_timesteps", "policy"):
         settings.pop(key, None)
     env = BatchedVecEnv([lambda: gym.make(name)] * settings.pop("n_envs"))
