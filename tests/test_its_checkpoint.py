@@ -32,8 +32,10 @@ def test_zips_and_log_are_left_in_the_folder(tmp_path):
     with (tmp_path / LOG_FILE).open() as file:
         rows = list(csv.DictReader(file))
     assert [row["level"] for row in rows] == [record.level for record in its.records]
-    assert list(rows[0]) == ["epoch", "level", "phase", "n_instances", "objective", "seconds", "generation_seconds"]
+    columns = ["epoch", "level", "phase", "n_instances", "objective", "seconds", "generation_seconds", "cpu_seconds"]
+    assert list(rows[0]) == columns
     for record in rows:
+        assert float(record["cpu_seconds"]) > 0
         generated = float(record["generation_seconds"])
         assert 0 <= generated <= float(record["seconds"])
         # The first epoch of an intensive block may have left enough for the second.

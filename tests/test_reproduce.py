@@ -1,16 +1,13 @@
-"""`sb3-uav reproduce`: the files that the nine commands write at the smallest scale."""
+"""`sb3-uav reproduce`: the files that the ten commands write at the smallest scale."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-import multiprocessing
 import shutil
-import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import matplotlib.image
@@ -22,8 +19,7 @@ from PIL import Image
 from sb3_uav.cli import main as cli
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
-from sb3_uav.reproduce.pairs import Models
+from sb3_uav.reproduce.output_files import COMPANIONS
 from sb3_uav.reproduce.paper import (
     EXACT_COLUMNS,
     FULL_COLUMNS,
@@ -34,11 +30,8 @@ from sb3_uav.reproduce.paper import (
     SIZES,
     paper_figure,
 )
-from sb3_uav.reproduce.scales import _SMOKE, Scenario, scenarios
+from sb3_uav.reproduce.scales import _SMOKE, SCALES, scenarios
 from sb3_uav.reproduce.targets import TARGETS
-from sb3_uav.reproduce.training_processes import _train_in_process, _TrainingProcess, train_pairs
-from sb3_uav.training.its_checkpoint import read_state, write_checkpoint
-from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 pytest.importorskip("rl_zoo3")
 
@@ -57,7 +50,7 @@ def numbers(row: dict[str, str], *columns: str) -> list[float]:
     return [float(row[column]) for column in columns]
 
 
-# ------------------------------------------------------------------------------------------------------------ all nine of them
+# ------------------------------------------------------------------------------------------------------------ all ten of them
 
 
 def run(*arguments: str | Path) -> int:
@@ -106,7 +99,7 @@ def threads() -> Iterator[None]:
 
 @pytest.mark.slow
 def test_every_file_says_where_it_comes_from(out: Path) -> None:
-    for name in TARGETS:
+    for name in (*TARGETS, *COMPANIONS["claims"]):
         for suffix in (".md", ".tex", ".csv"):
             text = (out / f"{name}{suffix}").read_text()
             for part in ("sb3-uav reproduce all --scale smoke", "Seed: 0", "Scale: smoke", "torch 2.", "X. Mao"):
@@ -144,19 +137,25 @@ def test_table1(out: Path) -> None:
 @pytest.mark.parametrize("name", ["table2", "table3"])
 def test_tables2_and_3(name: str, out: Path) -> None:
     columns, rows, comments = read_table(out / f"{name}.csv")
-    exact, full = (
+    exact, printed, further = (
         [f"{block}: {m}" for m in methods]
-        for block, methods in (("30 instances", EXACT_COLUMNS), ("500 instances", FULL_COLUMNS))
+        for block, methods in (
+            ("30 instances", EXACT_COLUMNS),
+            ("500 instances", FULL_COLUMNS),
+            ("500 instances", [f"{m} ({d})" for m in ("DL-DRL short", "Untrained") for d in ("Greedy", "Sampling")]),
+        )
     )
+    full = [*printed, *further]
     assert columns == ["Number of tasks", "Measure", "Source", *exact, *full]
     keys = [(row["Number of tasks"], row["Measure"], row["Source"]) for row in rows]
     assert keys == [(str(n), measure, source) for n in SIZES for measure in MEASURES for source in ("paper", "ours")]
     cells = {key: row for key, row in zip(keys, rows, strict=True)}
     for (size, measure, source), row in cells.items():
         if source == "paper":
-            for column in (*exact, *full):
+            for column in (*exact, *printed):
                 assert float(row[column]) == paper_figure(name, size, *column.split(": "), MEASURES[measure])
-    always = [column for column in full if "DL-DRL" in column or "K-means" in column]
+            assert all(row[column] == "" for column in further)
+    always = [column for column in full if "OR-tools" not in column]
     for size in map(str, SIZES):
         n_tasks = int(size) // 10
         assert all(0 <= value <= n_tasks for value in numbers(cells[size, "Obj.", "ours"], *always, *exact[1:]))
@@ -179,7 +178,9 @@ def test_table4(out: Path) -> None:
     assert columns[:3] == ["Fleet", "Method", "Source"]
     assert columns[3:] == [f"N={size}: {measure}" for size in LARGER_SIZES for measure in ("Obj.", "Time(s)")]
     keys = [(row["Fleet"], row["Method"], row["Source"]) for row in rows]
-    assert keys == [(f, m, s) for f in ("U4", "U6") for m in LARGER_METHODS for s in ("paper", "ours")]
+    methods = [(m, s) for m in LARGER_METHODS for s in ("paper", "ours")]
+    methods += [("DL-DRL short", "ours"), ("Untrained", "ours")]
+    assert keys == [(fleet, method, source) for fleet in ("U4", "U6") for method, source in methods]
     for (fleet, method, source), row in zip(keys, rows, strict=True):
         for size in LARGER_SIZES:
             objective = row[f"N={size}: Obj."]
@@ -202,31 +203,39 @@ def test_fig3(out: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, n_trainings", [("fig4", 4), ("fig5", 4)])
-def test_curves_of_every_epoch(name: str, n_trainings: int, out: Path) -> None:
-    """Those of the logs, with the opposite sign."""
+@pytest.mark.parametrize(
+    "name, trainings, log",
+    [
+        ("fig4", ["mixture"], "models/mixture/ITS"),
+        ("fig5", ["ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive"], "ablation/U4-N80/ITS/seed1"),
+    ],
+)
+def test_curves_of_every_epoch(name: str, trainings: list[str], log: str, out: Path) -> None:
+    """Those of the logs, with the opposite sign; in Fig. 5 of two seeds."""
     _, rows, _ = read_table(out / f"{name}_curves.csv")
-    trainings = list(dict.fromkeys(row["Training"] for row in rows))
-    assert len(trainings) == n_trainings
+    assert list(dict.fromkeys(row["Training"] for row in rows)) == trainings
+    seeds = ("0", "1") if name == "fig5" else (None,)
     for training in trainings:
-        upper = [row for row in rows if row["Training"] == training and row["Level"] == "Upper level"]
-        assert [int(row["Epoch"]) for row in upper] == [1, 2, 3, 4]
-        assert all(float(row["Cost"]) <= 0 for row in upper)
-        assert float(upper[-1]["Minutes"]) > 0
-    with (out / "models/U4-N80/ITS/its_log.csv").open() as file:
+        for seed in seeds:
+            of_seed = [row for row in rows if (row["Training"], row.get("Seed")) == (training, seed)]
+            upper = [row for row in of_seed if row["Level"] == "Upper level"]
+            assert [int(row["Epoch"]) for row in upper] == [1, 2, 3, 4]
+            assert all(float(row["Cost"]) <= 0 for row in upper) and float(upper[-1]["Minutes"]) > 0
+    with (out / log / "its_log.csv").open() as file:
         logged = [-float(row["objective"]) for row in csv.DictReader(file) if row["level"] == "allocator"]
-    drawn = [float(r["Cost"]) for r in rows if r["Training"] in ("U4-80", "ITS") and r["Level"] == "Upper level"]
+    mine = [r for r in rows if (r["Training"], r.get("Seed")) == (trainings[0], seeds[-1])]
+    drawn = [float(row["Cost"]) for row in mine if row["Level"] == "Upper level"]
     assert drawn == pytest.approx(logged, abs=1e-4)
 
 
 @pytest.mark.slow
 def test_routers_of_both_strategies_have_as_many_epochs(out: Path) -> None:
-    """DL-DRL-I trains its router as long as DL-DRL, before the allocator's first epoch."""
+    """DL-DRL-I trains its router as long as DL-DRL short, before the allocator's first epoch."""
     phases = {}
     for strategy in ("ITS", "independent"):
-        with (out / f"models/U4-N80/{strategy}/its_log.csv").open() as file:
+        with (out / f"models/mixture/{strategy}/its_log.csv").open() as file:
             phases[strategy] = [row["phase"] for row in csv.DictReader(file) if row["level"] == "router"]
-    assert len(phases["ITS"]) == len(phases["independent"]) == 1 + 2 + 2
+    assert len(phases["ITS"]) == len(phases["independent"]) == 2 + 2
     assert set(phases["independent"]) == {"pre-training"} != set(phases["ITS"])
 
 
@@ -249,22 +258,73 @@ def test_fig5_leaves_out_what_it_says(out: Path) -> None:
 def test_figs6_and_7(name: str, fleet: str, out: Path) -> None:
     columns, rows, _ = read_table(out / f"{name}.csv")
     assert columns == ["Method", *(f"N-{size}" for size in SIZES)]
-    assert [row["Method"] for row in rows] == [f"{fleet}-80", f"{fleet}-200", "K-means+VND", "K-means+AM", "DL-DRL-I"]
+    pairs = ["universal", "mixture", "U4-80"] if fleet == "U4" else ["universal", "mixture"]
+    assert [row["Method"] for row in rows] == [*pairs, "K-means+VND", "K-means+AM", "DL-DRL-I", "Untrained"]
     for row in rows:
         assert all(0 <= value <= size // 10 for size, value in zip(SIZES, numbers(row, *columns[1:]), strict=True))
     # The same results as in the table.
     _, table, _ = read_table(out / f"{'table2' if fleet == 'U4' else 'table3'}.csv")
-    sampling = {
-        r["Number of tasks"]: r["500 instances: DL-DRL (Sampling)"]
-        for r in table
-        if r["Measure"] == "Obj." and r["Source"] == "ours"
-    }
-    assert rows[0]["N-80"] == sampling["80"] and rows[1]["N-500"] == sampling["500"]
+    ours = {r["Number of tasks"]: r for r in table if r["Measure"] == "Obj." and r["Source"] == "ours"}
+    assert rows[0]["N-80"] == ours["80"]["500 instances: DL-DRL (Sampling)"]
+    assert rows[1]["N-500"] == ours["500"]["500 instances: DL-DRL short (Sampling)"]
+    assert rows[-1]["N-300"] == ours["300"]["500 instances: Untrained (Sampling)"]
+
+
+@pytest.mark.slow
+def test_claims(out: Path) -> None:
+    """The differences of the tables, and ratios of their cells."""
+    _, verdicts, _ = read_table(out / "claims.csv")
+    _, comparisons, _ = read_table(out / "claims_comparisons.csv")
+    _, ratios, _ = read_table(out / "claims_ratios.csv")
+    _, table, _ = read_table(out / "table3.csv")
+    (cells,) = (r for r in table if (r["Number of tasks"], r["Measure"], r["Source"]) == ("300", "Obj.", "ours"))
+    independent, vnd, ortools = (float(cells[f"500 instances: {m}"]) for m in ("DL-DRL-I (Greedy)", "K-means+VND", "OR-tools"))
+    text = "DL-DRL-I (Greedy) visits more tasks than K-means+VND"
+    (compared,) = (r for r in comparisons if r["Claim"] == text and r["Comparison"] == "U6-300")
+    assert float(compared["Difference"]) == pytest.approx(independent - vnd, abs=0.011) and compared["n"] == "2"
+    assert float(compared["Low"]) <= float(compared["Difference"]) <= float(compared["High"])
+    (verdict,) = (r for r in verdicts if (r["Where"], r["Claim"]) == ("Table III", text))
+    assert sum(int(verdict[side]) for side in ("For", "Open", "Against")) == 6
+    assert verdict["Verdict"] in ("holds", "not decided", "does not hold")
+    (ratio,) = (r for r in ratios if (r["Situation"], r["Method"]) == ("U6-300", "K-means+VND"))
+    assert float(ratio["Ours"]) == pytest.approx(vnd / ortools, abs=0.002) and float(ratio["Paper"]) == 0.64
+    assert not any(r["Verdict"] == "no data" for r in verdicts if r["Where"] != "Fig. 7")
+
+
+@pytest.mark.slow
+def test_pairs_before_training(out: Path) -> None:
+    """Those of the recipe, which the trained ones of the same seed are not any more."""
+    for level in ("allocator", "router"):
+        new, trained = (load_policy(out / f"models/mixture/{name}/{level}.zip") for name in ("untrained-seed0", "ITS"))
+        parameters = new.state_dict()
+        assert parameters.keys() == trained.state_dict().keys()
+        assert any(not th.equal(value, parameters[key]) for key, value in trained.state_dict().items())
+
+
+@pytest.mark.slow
+def test_one_pair_for_every_situation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The structure of scale paper: no shipped pair, and Fig. 5 shares its training with the tables."""
+    assert _SMOKE.ablation is not None
+    scale = replace(_SMOKE, universal=False, trained_sizes=(80,), recipe=_SMOKE.ablation, ablation=None, timing=None)
+    monkeypatch.setitem(SCALES, "smoke", scale)
+    assert run("table1", "fig5", "fig6", "--solvers", "kmeans-am", "--scale", "smoke", "--out", tmp_path) == 0
+    _, rows, _ = read_table(tmp_path / "fig6.csv")
+    assert [row["Method"] for row in rows] == ["U4-80", "K-means+AM", "DL-DRL-I", "Untrained"]
+    assert all(0 <= float(row["N-500"]) <= 50 for row in rows)
+    trained = {path.parent.relative_to(tmp_path).as_posix() for path in tmp_path.glob("models/*/*/training.json")}
+    strategies = ("ITS", "ITS-without-pre-training", "ITS-without-intensive", "ITS-without-both", "independent")
+    assert trained == {*(f"models/U4-N80/{strategy}" for strategy in strategies), "models/U6-N80/ITS"}
+    _, rows, _ = read_table(tmp_path / "fig5.csv")
+    assert [row["Seed"] for row in rows] == ["0"] * 4
 
 
 @pytest.mark.slow
 def test_the_second_time_nothing_is_done_again(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kept = [*(out / "models").rglob("*"), *(out / "evaluations").rglob("results.csv")]
+    kept = [
+        *(out / "models").rglob("*/its_log.csv"),
+        *(out / "ablation").rglob("*"),
+        *(out / "evaluations").rglob("results.csv"),
+    ]
     before = {path: path.read_bytes() for path in kept if path.is_file()}
     assert run("table2", "fig5", "--scale", "smoke", "--out", out) == 0
     assert {path: path.read_bytes() for path in before} == before
@@ -277,18 +337,18 @@ def test_the_second_time_nothing_is_done_again(out: Path, capsys: pytest.Capture
 def test_own_pairs(out: Path, tmp_path: Path, threads: None, capsys: pytest.CaptureFixture[str]) -> None:
     """One pair for a scenario, one for all sizes of another fleet, and nothing else."""
     models = tmp_path / "mine"
-    shutil.copytree(out / "models/U4-N80/ITS", models / "U4-N80/ITS")
-    shutil.copytree(out / "models/U6-N200/ITS", models / "U6/ITS")
+    shutil.copytree(out / "ablation/U4-N80/ITS/seed0", models / "U4-N80/ITS")
+    shutil.copytree(out / "models/mixture/ITS", models / "U6/ITS")
     results = tmp_path / "results"
     assert run("fig3", "fig7", "--scale", "smoke", "--models", models, "--no-training", "--solvers", "--out", results) == 0
     _, rows, comments = read_table(results / "fig3.csv")
     situations = [row["Situation"] for row in rows]
-    assert situations == ["U4-80", "U4-100", *(scenario.name for scenario in scenarios() if scenario.n_uavs == 6)]
+    assert situations == ["U4-80", *(scenario.name for scenario in scenarios() if scenario.n_uavs == 6)]
     assert any("There is no pair for U4-500, and --no-training forbids training one" in comment for comment in comments)
     _, rows, comments = read_table(results / "fig7.csv")
-    assert [row["Method"] for row in rows] == ["U6"]
+    assert [row["Method"] for row in rows] == ["U6", "Untrained"]
     assert any("K-means+VND was not requested" in comment for comment in comments)
-    assert not (results / "models").exists() and "training 1" not in capsys.readouterr().err
+    assert not (results / "training").exists() and "training 1" not in capsys.readouterr().err
     (models / "U4-N80/ITS/router.zip").unlink()
     assert run("fig3", "--scale", "smoke", "--models", models, "--no-training", "--out", results) == 2
     assert "router.zip: no such file; --models needs both zips of a pair" in capsys.readouterr().err
@@ -308,84 +368,6 @@ def test_a_license_that_is_too_small(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert {row["30 instances: Gurobi (1800s)"] for row in rows if row["Source"] == "ours"} == {""}
     expected = "# U4-80: milp with gurobi (1 s): milp:time_limit=1,backend=gurobi: no license\n"
     assert expected in comments and "solved by gurobi" in "".join(comments)
-
-
-def job(folder: Path, strategy: str = ITS, **its: Any) -> PairTraining:
-    entry = training_entry(_SMOKE, _SMOKE.recipe, Scenario(4, 80), strategy)
-    entry["callback"][0]["sb3_uav.training.ITSCallback"].update(its)
-    return PairTraining(Scenario(4, 80), strategy, entry, folder / "training", folder / "models" / strategy, 0, "cpu", 1)
-
-
-@pytest.mark.slow
-def test_an_interrupted_training_goes_on(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: None) -> None:
-    """With the same result as if it had not been interrupted."""
-
-    def interrupted(folder: Path, *args: Any) -> None:
-        write_checkpoint(folder, *args)
-        if read_state(folder)["epoch"] == 2:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sb3_uav.training.its.write_checkpoint", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            train_pair(job(tmp_path))
-    assert not (tmp_path / "models").exists()
-    with pytest.raises(TrainingError, match="holds an unfinished training with other settings; delete it"):
-        train_pair(job(tmp_path, n_epochs=5))
-    train_pair(job(tmp_path))
-    for name in ("allocator.zip", "router.zip"):
-        resumed, unbroken = load_policy(tmp_path / "models/its" / name), load_policy(out / "models/U4-N80/ITS" / name)
-        assert all(th.equal(value, resumed.state_dict()[key]) for key, value in unbroken.state_dict().items()), name
-    columns = ("epoch", "level", "phase", "n_instances", "objective")
-    logs = []
-    for path in (tmp_path / "models/its/its_log.csv", out / "models/U4-N80/ITS/its_log.csv"):
-        with path.open() as file:
-            logs.append([[row[column] for column in columns] for row in csv.DictReader(file)])
-    assert logs[0] == logs[1]
-    about = json.loads((tmp_path / "models/its/training.json").read_text())
-    assert about["strategy"] == ITS and about["seed"] == 0 and "torch" in about["versions"]
-
-
-@pytest.mark.slow
-def test_trainings_in_parallel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    jobs = [job(tmp_path / str(index), strategy, n_epochs=1) for index, strategy in enumerate((ITS, INDEPENDENT))]
-    train_pairs(jobs, 2)
-    assert all((j.model_folder / "allocator.zip").is_file() and (j.model_folder / "its_log.csv").is_file() for j in jobs)
-    assert "2 trainings, 2 at once: U4-80, independent: allocator epoch 1 of 1" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_failed_training_says_where_to_look(tmp_path: Path) -> None:
-    broken = job(tmp_path)
-    broken.entry["learning_rat"] = 1.0
-    with pytest.raises(TrainingError, match=r"Training U4-80, its failed: .*did you mean 'learning_rate'.*output\.txt"):
-        train_pair(broken)
-
-
-@pytest.mark.slow
-def test_a_failed_process_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = job(tmp_path)
-    broken.entry["learning_rat"] = 1.0
-    over = SimpleNamespace(join=lambda: None, exitcode=1)
-    receiver, sender = multiprocessing.Pipe(duplex=False)
-    with monkeypatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(signal, "signal", lambda *_: None)
-        _train_in_process(broken, sender)
-    with pytest.raises(TrainingError, match=r"failed: .*did you mean 'learning_rate'"):
-        _TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
-    sender.close()
-    with pytest.raises(TrainingError, match="U4-80, its failed: its process died; was it out of memory"):
-        _TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
-
-
-@pytest.mark.slow
-def test_pairs_of_other_settings_are_not_used(out: Path, tmp_path: Path) -> None:
-    shutil.copytree(out / "models/U4-N80/ITS", tmp_path / "models/U4-N80/ITS")
-    with pytest.raises(TrainingError, match="was trained with other settings or another seed; delete it"):
-        Models(_SMOKE, tmp_path, seed=1).get([(Scenario(4, 80), ITS)])
-    (tmp_path / "models/U4-N80/ITS/training.json").write_text("{")
-    with pytest.raises(TrainingError, match=r"training\.json: is damaged"):
-        Models(_SMOKE, tmp_path).get([(Scenario(4, 80), ITS)])
 
 
 @pytest.mark.parametrize(

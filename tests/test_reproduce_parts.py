@@ -16,15 +16,18 @@ import torch as th
 from its_logs import LOG
 
 from sb3_uav.cli import main as cli
+from sb3_uav.common import random_streams
+from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.evaluation.summary import gaps
 from sb3_uav.reproduce import paper
 from sb3_uav.reproduce.evaluator import Evaluator
-from sb3_uav.reproduce.figures_3_to_7 import _read_logged_curves
+from sb3_uav.reproduce.figures_3_to_7 import read_logged_curves
+from sb3_uav.reproduce.methods import explanations, learned_methods, learned_pairs
 from sb3_uav.reproduce.origin import Origin
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, check_complete, training_entry
-from sb3_uav.reproduce.pairs import Model
+from sb3_uav.reproduce.pairs import SHIPPED, UNTRAINED, Model, Models
 from sb3_uav.reproduce.paper import paper_figure, paper_tables
-from sb3_uav.reproduce.scales import _CPU, _PAPER, _SMOKE, SCALES, Scale, Scenario, scenarios
+from sb3_uav.reproduce.scales import _CPU, _PAPER, _SMOKE, MIXTURE, SCALES, Scale, Scenario, scenarios
 from sb3_uav.reproduce.table_formats import Column, Table, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.table_layout import _best, lay_out
 from sb3_uav.reproduce.tables_1_to_4 import _phase_times, _seconds
@@ -102,7 +105,9 @@ def test_the_copied_cells_are_named() -> None:
 
 
 def test_untrained_sizes_are_solved_by_the_nearest_pair() -> None:
-    assert [_SMOKE.trained_for(Scenario(6, size)).n_tasks for size in paper.SIZES] == [80, 80, 200, 200, 200, 200]
+    several = replace(_SMOKE, universal=False)
+    assert [several.trained_for(Scenario(6, size)).n_tasks for size in paper.SIZES] == [80, 80, 200, 200, 200, 200]
+    assert {_CPU.trained_for(scenario) for scenario in scenarios()} == {MIXTURE}
     assert [_PAPER.trained_for(Scenario(4, size)).n_tasks for size in (*paper.SIZES, 600, 1500)] == [*paper.SIZES, 500, 500]
 
 
@@ -120,11 +125,44 @@ def test_training_entries() -> None:
     assert (entry["n_envs"], entry["instances_per_epoch"], entry["learning_rate"]) == (256, 1_280_000, 1e-4)
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
     assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
-    cpu = training_entry(_CPU, _CPU.recipe, Scenario(4, 300), NO_INTENSIVE)
+    assert len(entry["callback"]) == 2
+    # At the others those of two cores; no table needs the evaluations during the training.
+    cpu = training_entry(_CPU, _CPU.recipe, MIXTURE, INDEPENDENT)
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
-    assert (cpu["instances_per_epoch"], cpu["baseline"], its["router"]["baseline"]) == (320, "shared", "shared")
-    assert (its["strategy"], its["n_epochs"], its["n_intensive_epochs"]) == ("no-intensive", 24, 8)
+    assert (cpu["env_kwargs"], cpu["baseline"], len(cpu["callback"])) == ({"n_tasks": 500, "max_distance": 2.0}, "shared", 1)
+    assert (its["strategy"], its["n_pretraining_epochs"], its["router"]["lr_decay"]) == ("independent", 0, 0.9)
+    assert "preset" not in cpu["policy_kwargs"] and its["warm_start"]["n_updates"] > 0
+    assert _CPU.ablation is not None
+    ablation = training_entry(_CPU, _CPU.ablation, Scenario(4, 80), NO_INTENSIVE)
+    its = ablation["callback"][0]["sb3_uav.training.ITSCallback"]
+    assert (its["warm_start"], its["n_pretraining_epochs"], its["strategy"]) == (None, 5, "no-intensive")
     assert training_entry(_SMOKE, _SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
+
+
+def test_methods(tmp_path: Path) -> None:
+    """DL-DRL-I is compared with the pair that is trained as long as it."""
+    assert learned_methods(Models(_CPU, tmp_path)) == {
+        "DL-DRL-I": INDEPENDENT,
+        "DL-DRL": SHIPPED,
+        "DL-DRL short": ITS,
+        "Untrained": UNTRAINED,
+    }
+    trained = {"DL-DRL-I": INDEPENDENT, "DL-DRL": ITS, "Untrained": UNTRAINED}
+    assert learned_methods(Models(_CPU, tmp_path, train_pair=True)) == trained
+    assert learned_methods(Models(_CPU, tmp_path, given=tmp_path)) == learned_methods(Models(_PAPER, tmp_path)) == trained
+    pairs = learned_pairs(Models(_CPU, tmp_path, training=False), [Scenario(6, 900)])
+    assert {method: model.label for (_, method), model in pairs.items()} == {"DL-DRL": "universal", "Untrained": "mixture"}
+    assert not any("compare these two" in note for note in explanations(Models(_PAPER, tmp_path)))
+
+
+def test_instances_that_no_campaign_used() -> None:
+    seeds = [value for name, value in vars(random_streams).items() if name.endswith("_SEED")]
+    assert seeds.count(random_streams.REPRODUCTION_SEED) == 1
+    generator = UniformGenerator(80, 4)
+    found = Evaluator(_CPU, Path("unused")).instances(Scenario(4, 80), n_instances=2)
+    for seed in seeds:
+        others = generator(2, random_streams.keyed_generator(seed, 0, 4, 80))
+        assert th.equal(found.tasks, others.tasks) == (seed == random_streams.REPRODUCTION_SEED)
 
 
 def training(scale: Scale, scenario: Scenario, strategy: str) -> PairTraining:
@@ -321,11 +359,19 @@ def test_phase_times(logged: Model) -> None:
 
 def test_curves(logged: Model) -> None:
     assert logged.its_log is not None
-    curves = _read_logged_curves(logged.its_log)
+    curves = read_logged_curves(logged.its_log)
     assert curves["allocator"].cost.tolist() == [-30.0, -31.0]
     assert curves["allocator"].minutes.tolist() == pytest.approx([18 / 60, 41 / 60])
     assert curves["router"].phase.count("pre-training") == 1 and curves["router"].minutes[-1] == pytest.approx(47 / 60)
     assert curves["router"].generation_minutes == pytest.approx(3 / 60)
+
+
+def test_curves_have_cpu_times(logged: Model) -> None:
+    """Wall times are those of a machine that may be busy; old logs have no others."""
+    assert logged.its_log is not None
+    header, *lines = LOG.splitlines()
+    logged.its_log.write_text("\n".join([f"{header},cpu_seconds", *(f"{line},3.0" for line in lines)]) + "\n")
+    assert read_logged_curves(logged.its_log)["allocator"].minutes.tolist() == pytest.approx([6 / 60, 12 / 60])
 
 
 @pytest.mark.parametrize(
@@ -343,6 +389,6 @@ def test_curves(logged: Model) -> None:
 def test_damaged_logs(content: str | bytes, message: str, logged: Model) -> None:
     assert logged.its_log is not None
     logged.its_log.write_bytes(content.encode() if isinstance(content, str) else content)
-    for read in (lambda: _phase_times(logged), lambda: _read_logged_curves(logged.folder / "its_log.csv")):
+    for read in (lambda: _phase_times(logged), lambda: read_logged_curves(logged.folder / "its_log.csv")):
         with pytest.raises(ValueError, match=re.escape(str(logged.its_log)) + message):
             read()

@@ -24,8 +24,11 @@ _EPILOG = """\
 what is written:
   DIR/table1.md, .tex, .csv       the table, the paper's figures beside ours; the same for the data of figures
   DIR/fig3.png, .pdf              the figure, drawn from fig3_schedules.csv, fig4_curves.csv, fig5_curves.csv or its own table
+  DIR/claims.md, .tex, .csv       the paper's claims, and what our intervals say of each; claims_comparisons and claims_ratios
   DIR/models/U4-N80/ITS/          allocator.zip, router.zip, its_log.csv, training.json of each pair that was trained
-  DIR/training/, DIR/timing/      the zoo's own folders of the trainings; the runs that Table I times
+                                  (mixture/ITS/ of a pair for all situations)
+  DIR/ablation/, DIR/timing/      the same of the pairs of Fig. 5, and of the runs that Table I times
+  DIR/training/                   the zoo's own folders of the trainings
   DIR/evaluations/                results.csv and schedules.jsonl of every situation
   Every file states the command, scale, seed and versions that it was made with, and what was left out.
   Rerun an interrupted call to resume it; tables and figures share trainings and evaluations.
@@ -33,7 +36,7 @@ what is written:
 --models DIR:
   DIR/U4-N80/ITS/allocator.zip and router.zip; its_log.csv of the training for table1, fig4 and fig5. In place of
   U4-N80/ITS: U4/ITS for all sizes of a fleet, ITS for everything; in place of ITS: independent (DL-DRL-I), and for fig5
-  ITS-without-pre-training, ITS-without-intensive, ITS-without-both.
+  ITS-without-pre-training, ITS-without-intensive, ITS-without-both. The pair that comes with the package is not used then.
 """
 
 
@@ -60,6 +63,11 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--scale", choices=tuple(SCALES), default="smoke", help="size of the study (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of all files (default: reproduction/SCALE)")
     parser.add_argument("--models", type=Path, metavar="DIR", help="use the trained pairs in DIR (see below)")
+    parser.add_argument(
+        "--train-pair",
+        action="store_true",
+        help="at scales whose DL-DRL is the pair that comes with the package: use the pair that is trained here instead",
+    )
     parser.add_argument("--no-training", action="store_true", help="leave out results that need further training")
     parser.add_argument(
         "--solvers",
@@ -158,8 +166,7 @@ def _make_session(
     scale = SCALES[args.scale]
     if args.exact_backend is not None:
         scale = replace(scale, exact_backend=args.exact_backend)
-    models = Models(
-        scale, out, args.models, args.seed, args.device, args.num_threads, args.jobs, training=not args.no_training
-    )
+    threads, training = args.num_threads, not args.no_training
+    models = Models(scale, out, args.models, args.seed, args.device, threads, args.jobs, training, args.train_pair)
     evaluator = Evaluator(scale, out, args.seed, args.device, args.jobs, args.overwrite, progress)
     return Session(scale, models, evaluator, args.solvers, Origin.of(command, scale, args.seed), out)

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import csv
 import io
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 LOG_FILE = "its_log.csv"
+
+
+class Moment(NamedTuple):
+    """
+    :param wall: Wall time in seconds
+    :param cpu: CPU time of the process in seconds, of all its threads
+    """
+
+    wall: float
+    cpu: float
+
+    @classmethod
+    def now(cls) -> Moment:
+        """:return: The present"""
+        return cls(time.time(), time.process_time())
+
+    def since(self) -> Moment:
+        """:return: The times that have passed since this moment, rounded to milliseconds"""
+        return Moment(*(round(now - then, 3) for now, then in zip(Moment.now(), self, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -26,6 +46,7 @@ class EpochRecord:
     :param objective: Mean return of its training episodes
     :param seconds: Wall time
     :param generation_seconds: The part of it that was spent on making the router's instances, that is on allocating tasks
+    :param cpu_seconds: CPU time of the process, of all its threads
     """
 
     epoch: int
@@ -35,6 +56,7 @@ class EpochRecord:
     objective: float
     seconds: float
     generation_seconds: float = 0.0
+    cpu_seconds: float = 0.0
 
 
 def log_text(records: Sequence[EpochRecord]) -> str:

@@ -20,6 +20,8 @@ TEST_SEED = 20_000_003
 GRID_SEED = 30_000_001
 # Instances of benchmarks/ablation.py.
 ABLATION_SEED = 40_000_001
+# Instances of `sb3-uav reproduce`, which nothing else may use: no campaign has chosen a network or a setting by them.
+REPRODUCTION_SEED = 60_000_011
 # Validation set and trained router that all runs of a comparison share.
 SHARED_SEED = 0
 # The instance on which the compiled kernels of local search are loaded.

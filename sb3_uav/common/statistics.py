@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,6 +54,53 @@ def confidence_halfwidth(samples: np.ndarray) -> np.ndarray:
     if n < 2:
         return np.full(samples.shape[1:], np.nan)
     return _confidence_quantile(n - 1) * np.std(samples, axis=0, ddof=1) / math.sqrt(n)
+
+
+class Interval(NamedTuple):
+    """
+    :param mean: An estimate
+    :param low: Lower end of its confidence interval, of :data:`CONFIDENCE`; NaN with fewer than two samples
+    :param high: Upper end
+    :param n: Number of samples
+    """
+
+    mean: float
+    low: float
+    high: float
+    n: int
+
+    @classmethod
+    def of_mean(cls, samples: np.ndarray) -> Interval:
+        """
+        :param samples: ``(n,)``, for instance paired differences
+        :return: The interval of their mean
+        """
+        mean, halfwidth = float(np.mean(samples)), float(confidence_halfwidth(samples))
+        return cls(mean, mean - halfwidth, mean + halfwidth, len(samples))
+
+    @classmethod
+    def of_ratio(cls, values: np.ndarray, others: np.ndarray) -> Interval:
+        """
+        :param values: ``(n,)``
+        :param others: ``(n,)``, paired with them; their mean is above 0
+        :return: The interval of the ratio of the means, by the delta method
+        """
+        mean = float(np.mean(others))
+        ratio = float(np.mean(values)) / mean
+        halfwidth = float(confidence_halfwidth(values - ratio * others)) / mean
+        return cls(ratio, ratio - halfwidth, ratio + halfwidth, len(values))
+
+    def minus(self, number: float) -> Interval:
+        """
+        :param number: A number that is known exactly
+        :return: The interval of the difference
+        """
+        return Interval(self.mean - number, self.low - number, self.high - number, self.n)
+
+    @property
+    def sign(self) -> int:
+        """1 if the interval is above 0, -1 if it is below, 0 if it contains 0 or there is none."""
+        return int(self.low > 0) - int(self.high < 0)
 
 
 def significantly_positive(gain: np.ndarray, alpha: float) -> bool:

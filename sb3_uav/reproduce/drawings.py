@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +26,14 @@ DEPOT = "depot"
 UPPER_LEVEL, LOWER_LEVEL = "Upper level", "Lower level"
 SCHEDULE_COLUMNS = ("Situation", "Point", "x", "y", "Maximum distance", "UAV", "Stop")
 CURVE_COLUMNS = ("Training", "Level", "Epoch", "Phase", "Cost", "Minutes")
+
+
+def is_pair(name: str) -> bool:
+    """
+    :param name: A row of Figs. 6 and 7
+    :return: Whether it is the label of a pair, not the name of a method
+    """
+    return re.fullmatch(r"universal|mixture|U\d+(-\d+)?", name) is not None
 
 
 class _Curve(NamedTuple):
@@ -86,9 +98,10 @@ def _draw_learning_curves(table: Table) -> Any:
     :return: A matplotlib figure
     """
     curves = _read_curves(table)
+    # One training may be for all situations.
     fleets = sorted({name.partition("-")[0] for name in curves})
-    figure = new_figure(5.5 * len(fleets), 7.0)
-    colors = dict(zip(map(str, SIZES), _shades(len(SIZES)), strict=True))
+    figure = new_figure(5.5 * max(len(fleets), 2), 7.0)
+    colors = defaultdict(lambda: SERIES_COLORS[0], zip(map(str, SIZES), _shades(len(SIZES)), strict=True))
     grid = figure.subplots(2, len(fleets), squeeze=False)
     for line, level in zip(grid, (UPPER_LEVEL, LOWER_LEVEL), strict=True):
         for axes, fleet in zip(line, fleets, strict=True):
@@ -110,23 +123,37 @@ def _draw_ablation(table: Table) -> Any:
     """
     Fig. 5.
 
-    :param table: A row for each epoch of each level; the trainings are named after their strategies
+    :param table: A row for each epoch of each level; the trainings are named after their strategies. Of several seeds, the
+        mean is drawn, and the range
     :return: A matplotlib figure
     """
     figure = new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, sharey=True)
     style_axes(left, "by epoch", "epoch of the upper level", "cost")
     style_axes(right, "by training time", "minutes", "")
-    for position, (strategy, levels) in enumerate(_read_curves(table).items()):
-        curve = levels[UPPER_LEVEL]
+    titles = [column.title for column in table.columns]
+    # Earlier versions had one training of each strategy.
+    seeds = [row[titles.index("Seed")] for row in table.rows] if "Seed" in titles else [""] * len(table.rows)
+    for position, strategy in enumerate(dict.fromkeys(row[0] for row in table.rows)):
+        runs = []
+        for seed in dict.fromkeys(s for s, row in zip(seeds, table.rows, strict=True) if row[0] == strategy):
+            rows = [row for s, row in zip(seeds, table.rows, strict=True) if (s, row[0]) == (seed, strategy)]
+            runs.append(_read_curves(replace(table, rows=rows))[strategy][UPPER_LEVEL])
         look = {
             "color": SERIES_COLORS[position],
             "linewidth": 1.5,
             "label": f"{strategy} (ours)" if strategy == "ITS" else strategy,
         }
-        look |= _markers(len(curve.cost), position)
-        left.plot(np.arange(1, len(curve.cost) + 1), curve.cost, **look)
-        right.plot(curve.minutes, curve.cost, **look)
+        n_epochs = min(len(run.cost) for run in runs)
+        costs, minutes = (
+            np.stack([values[:n_epochs] for values in v]) for v in ([r.cost for r in runs], [r.minutes for r in runs])
+        )
+        look |= _markers(n_epochs, position)
+        epochs = np.arange(1, n_epochs + 1)
+        for axes, x in ((left, epochs), (right, minutes.mean(0))):
+            axes.plot(x, costs.mean(0), **look)
+            if len(runs) > 1:
+                axes.fill_between(x, costs.min(0), costs.max(0), color=look["color"], alpha=0.15, linewidth=0)
     left.xaxis.get_major_locator().set_params(integer=True)
     right.set_xlim(left=0)
     right.legend(fontsize=8.5, frameon=False, loc="upper right")
@@ -147,9 +174,9 @@ def _draw_generalization(table: Table) -> Any:
     problems = [column.title for column in table.columns[1:]]
     values = np.array([[np.nan if cell == MISSING else float(cell) for cell in row[1:]] for row in table.rows])
     shortfalls = np.array([gaps(column) for column in values.T.tolist()]).T
-    trained = [row[0] for row in table.rows if row[0] == "universal" or row[0].startswith("U")]
+    trained = [row[0] for row in table.rows if is_pair(row[0])]
     shades = iter(_shades(len(trained)))
-    others = iter((VERMILION, PURPLE, ORANGE))
+    others = cycle((VERMILION, PURPLE, ORANGE, "0.5"))
     for position, row in enumerate(table.rows):
         ours = row[0] in trained
         look = {"color": next(shades) if ours else next(others), "linestyle": "-" if ours else (0, (4, 2))}

@@ -7,18 +7,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from sb3_uav.common.random_streams import TEST_SEED, keyed_generator
+import numpy as np
+
+from sb3_uav.common.random_streams import REPRODUCTION_SEED, keyed_generator
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
+from sb3_uav.evaluation.results import RESULTS_FILE, read_results
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.evaluation.set_evaluation import Progress
 from sb3_uav.evaluation.summary import SummaryRow
+from sb3_uav.reproduce.methods import DL_DRL, METHOD_NAMES
 from sb3_uav.reproduce.pairs import Model
 from sb3_uav.reproduce.paper import GUROBI, KMEANS_AM, KMEANS_VND, OR_TOOLS
 from sb3_uav.reproduce.scales import Scale, Scenario
 from sb3_uav.solvers import Solver, make_solver
 from sb3_uav.solvers.unavailable import UnavailableSolver
-from sb3_uav.training.its_schedule import INDEPENDENT
 
 # The solvers that stand for the paper's baselines.
 BASELINES = {"milp": GUROBI, "ortools": OR_TOOLS, "kmeans-vnd": KMEANS_VND, "kmeans-am": KMEANS_AM}
@@ -28,10 +31,29 @@ class Results(NamedTuple):
     """
     :param rows: Summary of each solver, by its name
     :param failures: Error messages
+    :param folder: Where the results of every instance are; None if there are none
     """
 
     rows: dict[str, SummaryRow]
     failures: list[str]
+    folder: Path | None = None
+
+    def by_instance(self, solver: str, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """
+        :param solver: Name of a solver
+        :param seed: Seed of the solver
+        :return: Objectives and seconds, ``(n,)`` each; None if it has not solved all instances
+        """
+        row = self.rows.get(solver)
+        if self.folder is None or row is None or row.n_feasible < row.n_instances:
+            return None
+        found = {
+            result.instance: (result.objective, result.seconds)
+            for result in read_results(self.folder / RESULTS_FILE)
+            if result.solver == solver and result.seed == seed
+        }
+        values = np.array([found[instance] for instance in range(row.n_instances)], dtype=np.float64)
+        return values[:, 0], values[:, 1]
 
 
 @dataclass(frozen=True)
@@ -67,7 +89,7 @@ class Evaluator:
         """
         generator = UniformGenerator(self.scale.n_tasks(scenario), scenario.n_uavs, max_distance=self.scale.max_distance)
         n_instances = self.scale.n_instances[scenario.n_tasks] if n_instances is None else n_instances
-        key = (TEST_SEED, self.seed) if seed is None else (seed,)
+        key = (REPRODUCTION_SEED, self.seed) if seed is None else (seed,)
         return generator(n_instances, keyed_generator(*key, scenario.n_uavs, scenario.n_tasks))
 
     def run(
@@ -90,7 +112,7 @@ class Evaluator:
         self._begun.add(path)
         source = scenario.folder if self.scale.shrink == 1 else f"{scenario.folder} (N = {self.scale.n_tasks(scenario)})"
         rows = evaluate(solvers, {source: batch}, path, self.seed, self.progress, n_jobs=self.n_jobs, resume=resume)
-        return Results({row.solver: row for row in rows}, [failure for row in rows for failure in row.failures])
+        return Results({row.solver: row for row in rows}, [failure for row in rows for failure in row.failures], path)
 
     def baseline(self, solver: str, router: Model | None = None) -> Solver:
         """
@@ -132,7 +154,7 @@ class Evaluator:
 
         decode = "sampling" if sampling else "greedy"
         solver = load_dl_drl(str(model.allocator), str(model.router), decode, self.scale.samples, self.device)
-        method = "DL-DRL-I" if model.strategy == INDEPENDENT else "DL-DRL"
+        method = METHOD_NAMES.get(model.strategy, DL_DRL)
         solver.name = f"{method} {model.label} ({f'sampling {self.scale.samples}' if sampling else 'greedy'})"
         return solver
 

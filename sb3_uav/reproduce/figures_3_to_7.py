@@ -10,9 +10,11 @@ import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule, check_schedule
-from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL
+from sb3_uav.reproduce.blocks import Block, make_solvers
+from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL, is_pair
 from sb3_uav.reproduce.evaluator import complete
-from sb3_uav.reproduce.pairs import LEVELS, Model, read_log
+from sb3_uav.reproduce.methods import DL_DRL, DL_DRL_I, DL_DRL_SHORT, UNTRAINED_PAIR, column, explanations, learned_pairs
+from sb3_uav.reproduce.pairs import LEVELS, read_log
 from sb3_uav.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
@@ -26,20 +28,18 @@ from sb3_uav.reproduce.paper import (
 from sb3_uav.reproduce.scales import Scenario, scenarios
 from sb3_uav.reproduce.session import Notes, Session
 from sb3_uav.reproduce.table_formats import MISSING, Column, Table, number
-from sb3_uav.reproduce.tables_1_to_4 import trained_pairs
-from sb3_uav.solvers.base import Solver
-from sb3_uav.training.its_schedule import INDEPENDENT, ITS
+from sb3_uav.training.its_schedule import ITS
 
 _LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
 
 
-class _LoggedCurve(NamedTuple):
+class LoggedCurve(NamedTuple):
     """
     The epochs of one level of one training.
 
     :param cost: ``(n_epochs,)``, minus the mean objective of its episodes
     :param phase: Phase of each epoch
-    :param minutes: ``(n_epochs,)``, time since the beginning of the training, of both levels
+    :param minutes: ``(n_epochs,)``, CPU time since the beginning of the training, of both levels; wall time in old logs
     :param generation_minutes: Time spent generating the router's instances
     """
 
@@ -49,20 +49,21 @@ class _LoggedCurve(NamedTuple):
     generation_minutes: float
 
 
-def _read_logged_curves(its_log: Path) -> dict[str, _LoggedCurve]:
+def read_logged_curves(its_log: Path) -> dict[str, LoggedCurve]:
     """
     :param its_log: The ``its_log.csv`` of a training, in chronological order
     :return: The curves of both levels
     :raises ValueError: If the file is not such a log
     """
     rows = read_log(its_log)
-    minutes = np.cumsum([float(row["seconds"]) for row in rows]) / 60
+    # Earlier versions did not record CPU times.
+    minutes = np.cumsum([float(row.get("cpu_seconds") or row["seconds"]) for row in rows]) / 60
     generation = sum(float(row.get("generation_seconds") or 0.0) for row in rows) / 60
     curves = {}
     for level in LEVELS:
         mine = [index for index, row in enumerate(rows) if row["level"] == level]
         cost = np.array([-float(rows[index]["objective"]) for index in mine])
-        curves[level] = _LoggedCurve(cost, [rows[index]["phase"] for index in mine], minutes[mine], generation)
+        curves[level] = LoggedCurve(cost, [rows[index]["phase"] for index in mine], minutes[mine], generation)
     return curves
 
 
@@ -77,14 +78,14 @@ def fig3(session: Session) -> list[Path]:
     :return: Paths of the written files
     """
     here = scenarios()
-    pairs = trained_pairs(session, here, (ITS,))
+    pairs = learned_pairs(session.models, here, DL_DRL)
     columns = [Column(title) for title in ("Situation", "Tasks", "Visited", "Total length", "Tasks by UAV")]
     table = Table("Fig. 3", "Solution visualization of trained models in corresponding situations", columns)
     points = Table("Fig. 3", "depots, tasks and stops of the schedules", [Column(title) for title in SCHEDULE_COLUMNS])
     notes = Notes(f"Instances of seed {FIG3_SEED}, as in the paper, but not of its random generator. Decoding: sampling.")
     notes.add_stand_ins(session.scale, here)
     for scenario in here:
-        model = pairs.get((session.scale.trained_for(scenario), ITS))
+        model = pairs.get((scenario, DL_DRL))
         if model is None:
             notes.add(f"There is no pair for {scenario.name}, and --no-training forbids training one.")
             continue
@@ -128,13 +129,19 @@ def fig4(session: Session) -> list[Path]:
     :param session: The scale, the trained pairs, the evaluations and the output folder
     :return: Paths of the written files
     """
-    here = [scenario for scenario in scenarios() if scenario.n_tasks in session.scale.trained_sizes]
+    here = list(dict.fromkeys(map(session.scale.trained_for, scenarios())))
     models = session.models.get([(scenario, ITS) for scenario in here], log_needed=True)
-    curves = {s: _read_logged_curves(log) for s in here if (s, ITS) in models and (log := models[s, ITS].its_log) is not None}
+    curves = {s: read_logged_curves(log) for s in here if (s, ITS) in models and (log := models[s, ITS].its_log) is not None}
     notes = Notes("Cost: minus the mean number of tasks completed in the training episodes (lower level: by one UAV).")
-    notes.add("Until the dotted line, the lower level is pre-trained on whole instances.")
+    if session.scale.universal:
+        notes.add(
+            "One training for all sizes and fleets, in place of the paper's twelve. Its batches have random sizes, with which "
+            "the cost of an epoch varies."
+        )
+    else:
+        notes.add("Until the dotted line, the lower level is pre-trained on whole instances.")
     notes.add_stand_ins(session.scale, [])
-    missing = [scenario.name for scenario in scenarios() if scenario not in curves]
+    missing = [scenario.name for scenario in here if scenario not in curves]
     if missing:
         notes.add(f"Not trained at scale {session.scale.name}, or without the log of the training: {', '.join(missing)}.")
     titles = ("Situation", "Level", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last")
@@ -148,7 +155,7 @@ def fig4(session: Session) -> list[Path]:
     return session.write(table, "fig4", _curves_table("Fig. 4", {s.name: c for s, c in curves.items()}, table.notes))
 
 
-def _curves_table(label: str, curves: Mapping[str, Mapping[str, _LoggedCurve]], notes: Sequence[str]) -> Table:
+def _curves_table(label: str, curves: Mapping[str, Mapping[str, LoggedCurve]], notes: Sequence[str]) -> Table:
     table = Table(label, "every epoch", [Column(title) for title in CURVE_COLUMNS], notes=list(notes))
     for name, levels in curves.items():
         for level, curve in levels.items():
@@ -169,36 +176,53 @@ def fig5(session: Session) -> list[Path]:
     :return: Paths of the written files
     """
     scenario = Scenario(ABLATION_FLEET, ABLATION_SIZE)
-    models = session.models.get([(scenario, strategy) for strategy in ABLATION_STRATEGIES], log_needed=True)
-    curves = {
-        strategy: _read_logged_curves(log)
-        for strategy in ABLATION_STRATEGIES
-        if (scenario, strategy) in models and (log := models[scenario, strategy].its_log) is not None
-    }
+    curves = ablation_curves(session)
     notes = Notes(
         f"{scenario.name}. Cost: minus the mean number of tasks completed in the training episodes of the upper level.",
-        "ITS/X is the interactive training strategy without X. Minutes: of both levels, pre-training included.",
+        "ITS/X is the interactive training strategy without X. Minutes: CPU time of both levels, pre-training included.",
     )
     notes.add_stand_ins(session.scale, [])
+    if session.scale.ablation is not None:
+        its = session.scale.ablation.its
+        notes.add(
+            f"Trained for {scenario.name} without a warm start, {its['n_epochs']} epochs, {its['n_pretraining_epochs']} of "
+            f"pre-training; E_t = {its['n_intensive_epochs']}, E_c = {its['n_continuous_epochs']}."
+        )
     for strategy in ABLATION_STRATEGIES:
-        if strategy not in curves:
+        if strategy not in {name for name, _ in curves}:
             title = STRATEGY_TITLES[strategy]
             notes.add(f"{title}: there is no pair with the log of its training, and --no-training forbids training one.")
-    titles = ("Strategy", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last", "Minutes", "Data generation (min)")
-    table = Table("Fig. 5", "Ablation study results of ITS", [Column(title) for title in titles])
-    for strategy, levels in curves.items():
+    titles = ("Strategy", "Seed", "Epochs", "Cost of the first", "Lowest cost", "Cost of the last", "Minutes")
+    table = Table("Fig. 5", "Ablation study results of ITS", [*map(Column, titles), Column("Data generation (min)")])
+    every = Table("Fig. 5", "every epoch", [*map(Column, CURVE_COLUMNS), Column("Seed")], notes=notes.list())
+    for (strategy, seed), levels in curves.items():
         upper = levels["allocator"]
-        if len(upper.cost) == 0:
-            log = models[scenario, strategy].its_log
-            raise ValueError(f"{log}: has no epochs of the allocator; give the log of a whole training, or take it away.")
         minutes = max(curve.minutes[-1] for curve in levels.values() if len(curve.minutes) > 0)
         costs = [number(float(cost)) for cost in (upper.cost[0], upper.cost.min(), upper.cost[-1])]
         times = [number(float(minutes), 3), number(upper.generation_minutes, 3)]
-        table.add([STRATEGY_TITLES[strategy], str(len(upper.cost)), *costs, *times])
+        table.add([STRATEGY_TITLES[strategy], str(seed), str(len(upper.cost)), *costs, *times])
+        for row in _curves_table("", {STRATEGY_TITLES[strategy]: levels}, ()).rows:
+            every.add([*row, str(seed)])
     table.notes = notes.list()
-    return session.write(
-        table, "fig5", _curves_table("Fig. 5", {STRATEGY_TITLES[s]: c for s, c in curves.items()}, table.notes)
-    )
+    return session.write(table, "fig5", every)
+
+
+def ablation_curves(session: Session) -> dict[tuple[str, int], dict[str, LoggedCurve]]:
+    """
+    :param session: The scale and the trained pairs
+    :return: Curves of both levels by strategy and seed
+    :raises ValueError: If a log is damaged or has no epochs of the allocator
+    """
+    models = session.models.ablation(Scenario(ABLATION_FLEET, ABLATION_SIZE), ABLATION_STRATEGIES)
+    curves = {}
+    for key, model in models.items():
+        assert model.its_log is not None
+        curves[key] = read_logged_curves(model.its_log)
+        if len(curves[key]["allocator"].cost) == 0:
+            raise ValueError(
+                f"{model.its_log}: has no epochs of the allocator; give the log of a whole training, or take it away."
+            )
+    return curves
 
 
 # ----------------------------------------------------------------------------------------------------------- Figs. 6 and 7
@@ -232,27 +256,23 @@ def _generalization(session: Session, name: str, label: str, n_uavs: int) -> lis
     :param n_uavs: Number of UAVs
     :return: Paths of the written files
     """
-    here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
-    pairs = trained_pairs(session, here)
-    # The user may have one pair for several sizes.
-    ours = list({model.label: model for (_, strategy), model in pairs.items() if strategy == ITS}.values())
-    notes = Notes(
-        "Columns: the problems that are solved; rows: trained pairs (sampling) and baselines. Mean number of tasks.",
-        f"{KMEANS_AM} and DL-DRL-I: trained for the problem's size, or the nearest size that is trained at this scale.",
-    )
+    notes = Notes("Columns: the problems that are solved; rows: trained pairs (sampling) and baselines. Mean number of tasks.")
+    if session.scale.universal:
+        names = "universal: DL-DRL. mixture: DL-DRL short." if session.models.uses_shipped_pair else "mixture: DL-DRL."
+        notes.add(f"{names} The pair of one size is that of Fig. 5 (ITS), trained for less time, without a warm start.")
+    else:
+        notes.add(f"{KMEANS_AM} and {DL_DRL_I}: trained for the problem's size, or the nearest that is trained at this scale.")
     notes.add_stand_ins(session.scale, [])
+    notes.add(*explanations(session.models))
     counts = ", ".join(f"{session.scale.n_instances[size]} (N = {size})" for size in SIZES)
     notes.add(f"Instances: {counts}; {session.scale.samples} samples.")
-    objectives: dict[str, dict[int, float | None]] = {model.label: {} for model in ours}
-    for scenario in here:
-        solvers = {model.label: session.evaluator.pair(model, sampling=True) for model in ours}
-        solvers |= _baselines(session, scenario, pairs, notes)
-        results = session.evaluator.run(scenario, list(solvers.values()))
-        notes.add(*results.failures)
-        for method, solver in solvers.items():
-            objective = complete(results.rows.get(solver.name), lambda row: row.objective)
+    objectives: dict[str, dict[int, float | None]] = {}
+    blocks = generalization_blocks(session, n_uavs, notes)
+    for scenario, block in blocks.items():
+        for method in block.solvers:
+            objective = complete(block.rows.get(method), lambda row: row.objective)
             objectives.setdefault(method, {})[scenario.n_tasks] = objective
-    if not ours:
+    if not any(is_pair(method) for method in objectives):
         notes.add("There are no trained pairs, and --no-training forbids training them.")
     caption = f"Generalization to larger instances on U{n_uavs}"
     table = Table(label, caption, [Column("Method"), *(Column(f"N-{size}") for size in SIZES)])
@@ -262,21 +282,27 @@ def _generalization(session: Session, name: str, label: str, n_uavs: int) -> lis
     return session.write(table, name, table)
 
 
-def _baselines(
-    session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
-) -> dict[str, Solver]:
-    """The methods that Figs. 6 and 7 compare the pairs with, by name."""
-    found: dict[str, Solver] = {}
-    independent = pairs.get((session.scale.trained_for(scenario), INDEPENDENT))
-    if "kmeans-vnd" in session.solvers:
-        found[KMEANS_VND] = session.evaluator.baseline("kmeans-vnd")
-    else:
-        notes.add(f"{KMEANS_VND} was not requested (--solvers).")
-    if independent is None:
-        notes.add("DL-DRL-I has no trained pair, and --no-training forbids training one.")
-        return found
-    if "kmeans-am" in session.solvers:
-        found[KMEANS_AM] = session.evaluator.baseline("kmeans-am", independent)
-    else:
-        notes.add(f"{KMEANS_AM} was not requested (--solvers).")
-    return {**found, "DL-DRL-I": session.evaluator.pair(independent, sampling=True)}
+def generalization_blocks(session: Session, n_uavs: int, notes: Notes) -> dict[Scenario, Block]:
+    """
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param n_uavs: Number of UAVs
+    :param notes: Receives what is left out
+    :return: Results of the pairs, by their labels, and of the methods to compare them with, on the paper's sizes
+    """
+    here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
+    pairs = learned_pairs(session.models, here)
+    # One pair may serve several sizes.
+    ours = {model.label: model for (_, method), model in pairs.items() if method in (DL_DRL, DL_DRL_SHORT)}
+    if session.scale.universal and n_uavs == ABLATION_FLEET:
+        scenario = Scenario(ABLATION_FLEET, ABLATION_SIZE)
+        trained = session.models.ablation(scenario, (ITS,))
+        ours |= {model.label: model for (_, seed), model in trained.items() if seed == session.models.seed}
+    blocks = {}
+    for scenario in here:
+        solvers = {label: session.evaluator.pair(model, sampling=True) for label, model in ours.items()}
+        others = make_solvers(session, scenario, pairs, notes)
+        for name in (KMEANS_VND, KMEANS_AM, *(column(method, sampling=True) for method in (DL_DRL_I, UNTRAINED_PAIR))):
+            if name in others:
+                solvers[name.removesuffix(column("", sampling=True))] = others[name]
+        blocks[scenario] = Block.run(session, scenario, solvers, notes)
+    return blocks

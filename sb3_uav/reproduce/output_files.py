@@ -13,6 +13,8 @@ from sb3_uav.reproduce.origin import Origin
 from sb3_uav.reproduce.table_formats import Table, read_csv, to_csv, to_latex, to_markdown
 from sb3_uav.reproduce.table_layout import lay_out
 
+# Further tables that a target writes.
+COMPANIONS = {"claims": ("claims_comparisons", "claims_ratios")}
 _TABLE_FORMATS = {".md": to_markdown, ".tex": to_latex, ".csv": to_csv}
 _FIGURE_SUFFIXES = (".png", ".pdf")
 
@@ -49,6 +51,7 @@ def redraw(folder: Path, names: Iterable[str]) -> list[Path]:
     :raises ValueError: If a CSV is damaged, a file cannot be written, or there is no CSV at all
     """
     paths = []
+    names = [written for name in names for written in (name, *COMPANIONS.get(name, ()))]
     for name in names:
         if not (folder / f"{name}.csv").is_file():
             continue

@@ -16,14 +16,13 @@ import yaml
 
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
-from sb3_uav.registration import allocation_id
 from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
 _TRAINING_FILE = "training.json"
 _CONFIG_FILE, _OUTPUT_FILE = "config.yml", "output.txt"
-_ITS_KEY = "sb3_uav.training.ITSCallback"
+ITS_KEY = "sb3_uav.training.ITSCallback"
 
 
 class TrainingError(ValueError):
@@ -56,16 +55,17 @@ class PairTraining:
 
     @property
     def env_id(self) -> str:
-        return allocation_id(self.scenario.n_uavs, self.scenario.n_tasks)
+        return self.scenario.env_id
 
     @property
     def title(self) -> str:
-        return f"{self.scenario.name}, {self.strategy}"
+        seed = f", seed {self.seed}" if self.seed > 0 else ""
+        return f"{self.scenario.name}, {self.strategy}{seed}"
 
     @property
     def its(self) -> Mapping[str, Any]:
         """The arguments of the interactive training strategy."""
-        return self.entry["callback"][0][_ITS_KEY]
+        return self.entry["callback"][0][ITS_KEY]
 
     @property
     def schedule(self) -> EpochSchedule:
@@ -93,14 +93,16 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     """
     from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
-    config = default_config("paper")
+    config = default_config(recipe.config)
     if config is None:
-        raise FileNotFoundError("paper.yml: not found; install sb3-uav again.")
-    shipped = read_yaml(config)[allocation_id(scenario.n_uavs, scenario.n_tasks)]
+        raise FileNotFoundError(f"{recipe.config}.yml: not found; install sb3-uav again.")
+    shipped = read_yaml(config)[scenario.env_id]
     entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
-    its = entry["callback"][0][_ITS_KEY]
+    its = entry["callback"][0][ITS_KEY]
     its |= {**recipe.its, "strategy": strategy, "verbose": 1}
     its["router"] |= recipe.router
+    if not recipe.evaluations:
+        del entry["callback"][1:]
     if scenario.n_tasks in recipe.instances_per_epoch:
         entry["instances_per_epoch"] = recipe.instances_per_epoch[scenario.n_tasks]
     sizes = {"n_tasks": scale.n_tasks(scenario), "max_distance": scale.max_distance}
@@ -225,9 +227,9 @@ def _same_training(about: Mapping[str, Any], job: PairTraining) -> bool:
     :return: Whether the pair is its result. Earlier versions used the paper's names of the strategies, and trained the router
         of DL-DRL-I in the epochs of pre-training only
     """
-    its = {**about["entry"]["callback"][0][_ITS_KEY]}
+    its = {**about["entry"]["callback"][0][ITS_KEY]}
     its["strategy"] = strategy_name(its["strategy"])
-    entry = {**about["entry"], "callback": [{_ITS_KEY: its}, *about["entry"]["callback"][1:]]}
+    entry = {**about["entry"], "callback": [{ITS_KEY: its}, *about["entry"]["callback"][1:]]}
     n_router_epochs = job.schedule.n_router_epochs
     earlier = its["n_pretraining_epochs"] if job.strategy == INDEPENDENT else n_router_epochs
     return entry == job.entry and about["seed"] == job.seed and about.get("n_router_epochs", earlier) == n_router_epochs

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from sb3_uav.registration import UNIVERSAL_FLEET, UNIVERSAL_ID, UNIVERSAL_SIZE, allocation_id
 from sb3_uav.reproduce.paper import FLEETS, LARGER_SIZES, MAX_DISTANCE, SIZES
 
 
 @dataclass(frozen=True)
 class Scenario:
     """
-    One of the paper's situations.
+    One of the paper's situations, or :data:`MIXTURE`.
 
     :param n_uavs: Number of UAVs
     :param n_tasks: Number of tasks in the paper; a scale may let a smaller number stand in for it
@@ -25,12 +26,21 @@ class Scenario:
     @property
     def name(self) -> str:
         """Name in the paper."""
-        return f"U{self.n_uavs}-{self.n_tasks}"
+        return "mixture" if self == MIXTURE else f"U{self.n_uavs}-{self.n_tasks}"
 
     @property
     def folder(self) -> str:
         """Name of its folders."""
-        return f"U{self.n_uavs}-N{self.n_tasks}"
+        return "mixture" if self == MIXTURE else f"U{self.n_uavs}-N{self.n_tasks}"
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment of the allocator."""
+        return UNIVERSAL_ID if self == MIXTURE else allocation_id(self.n_uavs, self.n_tasks)
+
+
+# Training batches of mixed sizes and fleets, for one pair that serves all situations.
+MIXTURE = Scenario(UNIVERSAL_FLEET, UNIVERSAL_SIZE)
 
 
 @dataclass(frozen=True)
@@ -42,12 +52,16 @@ class Recipe:
     :param router: Changes to the router's algorithm
     :param its: Changes to the interactive training strategy
     :param instances_per_epoch: Instances per epoch by the paper's number of tasks; that of the entry where missing
+    :param config: Which of the zoo's YAML files the entry comes from
+    :param evaluations: Whether to keep the entry's evaluations during the training; no table or figure needs them
     """
 
     allocator: Mapping[str, Any] = field(default_factory=dict)
     router: Mapping[str, Any] = field(default_factory=dict)
     its: Mapping[str, Any] = field(default_factory=dict)
     instances_per_epoch: Mapping[int, int] = field(default_factory=dict)
+    config: str = "paper"
+    evaluations: bool = True
 
 
 @dataclass(frozen=True)
@@ -59,8 +73,12 @@ class Scale:
     :param text: Description in one sentence
     :param shrink: The paper's numbers of tasks are divided by this
     :param max_distance: Maximum flight distance
-    :param trained_sizes: The paper's numbers of tasks that pairs are trained for; others are solved by the nearest pair
+    :param universal: Whether pairs are trained for the mixture of all sizes and fleets, and one serves all situations
+    :param trained_sizes: Otherwise the paper's numbers of tasks that pairs are trained for; others are solved by the nearest.
+        In any case those that Table I times
     :param recipe: Training settings of these pairs
+    :param ablation: Training settings of Fig. 5; those of the other figures when None
+    :param n_ablation_seeds: Trainings of each strategy in Fig. 5
     :param timing: Training settings of the runs that Table I times; those of the other tables when None
     :param n_instances: Test instances by the paper's number of tasks (Tables II to IV, Figs. 6 and 7)
     :param n_exact_instances: Test instances of the exact solver
@@ -80,6 +98,9 @@ class Scale:
     time_limits: Mapping[str, float]
     samples: int
     timing: Recipe | None = None
+    ablation: Recipe | None = None
+    n_ablation_seeds: int = 1
+    universal: bool = False
     trained_sizes: tuple[int, ...] = SIZES
     shrink: int = 1
     max_distance: float = MAX_DISTANCE
@@ -94,9 +115,11 @@ class Scale:
     def trained_for(self, scenario: Scenario) -> Scenario:
         """
         :param scenario: The scenario to solve
-        :return: The scenario, of the same fleet, whose pair solves it: itself if it is trained at this scale, else the one
-            whose number of tasks is nearest in proportion
+        :return: The scenario whose pair solves it: the mixture, if pairs are universal; itself, if it is trained at this
+            scale; else the one of the same fleet whose number of tasks is nearest in proportion
         """
+        if self.universal:
+            return MIXTURE
         nearest = min(self.trained_sizes, key=lambda size: abs(math.log(size / scenario.n_tasks)))
         return Scenario(scenario.n_uavs, nearest)
 
@@ -109,26 +132,46 @@ def scenarios(sizes: tuple[int, ...] = SIZES) -> list[Scenario]:
     return [Scenario(n_uavs, n_tasks) for n_uavs in FLEETS for n_tasks in sizes]
 
 
-# The paper's networks, smaller. Its batch normalization needs larger batches than these scales have.
-_TINY = {"preset": "paper", "normalization": "instance", "embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16}
-_SMALL = {"preset": "paper", "normalization": "instance", "embed_dim": 64, "n_layers": 2, "n_heads": 4, "ff_dim": 128}
-# Eight samples per instance with their mean as the baseline: no second rollout and far fewer instances.
-_SHARED_BASELINE = {"baseline": "shared", "n_samples": 8, "normalize_advantage": True, "learning_rate": 1e-3}
+_TINY = {"embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16, "use_values": False}
+
+
+def _tiny_recipe(**its: Any) -> Recipe:
+    """
+    :param its: Changes to the interactive training strategy
+    :return: A training of a second
+    """
+    settings = {"policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4}
+    its |= {"n_epochs": 4, "router_instances_per_epoch": 64, "n_intensive_epochs": 2, "n_continuous_epochs": 2}
+    return Recipe({**settings, "instances_per_epoch": 16}, settings, its, config="reinforce", evaluations=False)
+
+
+def _timing_recipe(n_envs: int, n_instances: int, **settings: Any) -> Recipe:
+    """
+    :param n_envs: Instances of a batch
+    :param n_instances: Instances of an epoch
+    :param settings: Further changes to the algorithms of both levels
+    :return: Two epochs with the paper's baseline, to be timed
+    """
+    settings = {"n_envs": n_envs, "baseline_kwargs": {"n_test_instances": n_envs}, **settings}
+    its = {"n_epochs": 2, "n_pretraining_epochs": 0, "n_intensive_epochs": 0}
+    return Recipe(settings, settings, its, dict.fromkeys(SIZES, n_instances), evaluations=False)
+
 
 _SMOKE = Scale(
     name="smoke",
-    text="a test of the commands, not of the method: tiny networks, a tenth of the tasks, a maximum flight distance of 1",
+    text="a test of the commands, not of the method: tiny networks beside the shipped pair, a tenth of the tasks, a maximum "
+    "flight distance of 1",
     shrink=10,
     max_distance=1.0,
+    universal=True,
     trained_sizes=(80, 200),
-    recipe=Recipe(
-        allocator={**_SHARED_BASELINE, "policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4},
-        router={**_SHARED_BASELINE, "policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4},
-        its={"n_epochs": 4, "n_pretraining_epochs": 1, "n_intensive_epochs": 2, "n_continuous_epochs": 2},
-        instances_per_epoch=dict.fromkeys(SIZES, 16),
-    ),
+    recipe=_tiny_recipe(warm_start={"n_subsets": 32, "n_updates": 2}, n_pretraining_epochs=0),
+    # The recipe of cpu has no warm start in Fig. 5 either.
+    ablation=_tiny_recipe(warm_start=None, n_pretraining_epochs=1),
+    n_ablation_seeds=2,
+    timing=_timing_recipe(8, 16, policy_kwargs={**_TINY, "preset": "paper"}),
     n_instances=dict.fromkeys((*SIZES, *LARGER_SIZES), 2),
-    n_exact_instances=1,
+    n_exact_instances=2,
     exact_sizes=(80,),
     exact_backend="highs",
     time_limits={"milp": 1.0, "ortools-gls": 0.2, "pyvrp": 0.2},
@@ -137,23 +180,34 @@ _SMOKE = Scale(
 
 _CPU = Scale(
     name="cpu",
-    text="an afternoon on two CPU cores with two jobs: networks of width 64 with two layers, 24 epochs of 640 instances and "
-    "fewer, eight samples per instance with their mean as baseline in place of the greedy rollout",
+    text="an afternoon on two CPU cores with two jobs: the default networks, trained for all situations at once from a warm "
+    "start, 24 epochs of 256 instances, eight samples per instance with their mean as baseline; beside them the shipped pair",
+    universal=True,
     recipe=Recipe(
-        allocator={**_SHARED_BASELINE, "policy_kwargs": _SMALL, "n_envs": 32, "lr_decay": 0.92},
-        router={**_SHARED_BASELINE, "policy_kwargs": _SMALL, "n_envs": 32, "lr_decay": 0.95},
-        its={"n_epochs": 24},
-        instances_per_epoch={80: 640, 100: 640, 150: 640, 200: 640, 300: 320, 500: 192},
+        config="reinforce",
+        evaluations=False,
+        allocator={"lr_decay": 0.9, "instances_per_epoch": 256},
+        router={"lr_decay": 0.9},
+        its={
+            **{"n_epochs": 24, "n_pretraining_epochs": 0, "n_intensive_epochs": 8, "n_continuous_epochs": 4},
+            **{"router_instances_per_epoch": 640, "warm_start": {"n_subsets": 12_000, "n_updates": 2_400}},
+        },
     ),
-    timing=Recipe(
-        allocator={"n_envs": 32, "baseline_kwargs": {"n_test_instances": 32}},
-        router={"n_envs": 32, "baseline_kwargs": {"n_test_instances": 32}},
-        its={"n_epochs": 2, "n_pretraining_epochs": 0, "n_intensive_epochs": 0},
-        instances_per_epoch=dict.fromkeys(SIZES, 64),
+    # Without a warm start, which would be a pre-training of another kind in all of them.
+    ablation=Recipe(
+        config="reinforce",
+        evaluations=False,
+        allocator={"instances_per_epoch": 192},
+        its={
+            **{"n_epochs": 16, "n_pretraining_epochs": 5, "n_intensive_epochs": 8, "n_continuous_epochs": 4},
+            **{"router_instances_per_epoch": 512, "warm_start": None},
+        },
     ),
+    n_ablation_seeds=3,
+    timing=_timing_recipe(32, 64),
     n_instances={
-        **{80: 50, 100: 50, 150: 30, 200: 20, 300: 10, 500: 10},
-        **{600: 4, 700: 4, 800: 4, 900: 4, 1000: 4, 1500: 2},
+        **{80: 40, 100: 40, 150: 24, 200: 24, 300: 16, 500: 12},
+        **{600: 6, 700: 6, 800: 6, 900: 6, 1000: 6, 1500: 2},
     },
     n_exact_instances=3,
     exact_sizes=(80, 100, 150),

@@ -76,7 +76,7 @@ class Notes:
                 f"{scale.max_distance:g}: our figures cannot be compared with the paper's."
             )
         others = [f"{s.name} ({trained.name})" for s in scenarios if (trained := scale.trained_for(s)) != s]
-        if others:
+        if others and not scale.universal:
             self.add(f"Not trained at scale {scale.name}, and solved by the pair of another size: {', '.join(others)}.")
 
     def list(self) -> list[str]:

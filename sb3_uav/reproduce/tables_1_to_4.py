@@ -8,24 +8,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.evaluation.summary import SummaryRow, gaps
-from sb3_uav.reproduce.evaluator import BASELINES, complete
+from sb3_uav.reproduce.blocks import Block, Pairs, exact_block, full_block, make_solvers
+from sb3_uav.reproduce.evaluator import complete
+from sb3_uav.reproduce.methods import column, explanations, learned_methods, learned_pairs, other_columns, other_methods
 from sb3_uav.reproduce.pairs import Model, read_log
 from sb3_uav.reproduce.paper import (
     EXACT_BLOCK,
     EXACT_COLUMNS,
     FULL_BLOCK,
     FULL_COLUMNS,
-    GREEDY,
-    GUROBI,
-    INDEPENDENT_GREEDY,
-    INDEPENDENT_SAMPLING,
     INSTANCES_PER_EPOCH,
-    KMEANS_AM,
     LARGER_METHODS,
     LARGER_SIZES,
     MEASURES,
     PHASES,
-    SAMPLING,
     SIZES,
     paper_figure,
     paper_tables,
@@ -33,8 +29,6 @@ from sb3_uav.reproduce.paper import (
 from sb3_uav.reproduce.scales import Scenario, scenarios
 from sb3_uav.reproduce.session import Notes, Session
 from sb3_uav.reproduce.table_formats import Column, Table, number
-from sb3_uav.solvers.base import Solver
-from sb3_uav.training.its_schedule import INDEPENDENT, ITS
 
 _PAPER, _OURS = "paper", "ours"
 _FASTEST_SHOWN = 0.1
@@ -87,7 +81,8 @@ def table1(session: Session) -> list[Path]:
     if own:
         notes.add(f"Trainings of the given pairs (--models): {', '.join(own)}.")
     if session.scale.timing is not None and len(own) < len(models):
-        notes.add(f"Our runs have the paper's networks and baseline, but batches of {_batch_size(session)} instances.")
+        networks = "" if "policy_kwargs" in session.scale.timing.allocator else "networks and "
+        notes.add(f"Our runs have the paper's {networks}baseline, but batches of {_batch_size(session)} instances.")
     notes.add_stand_ins(session.scale, [])
     measured: dict[int, list[str]] = {}
     missing: list[str] = []
@@ -173,21 +168,22 @@ def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list
     :return: Paths of the written files
     """
     here = [Scenario(n_uavs, n_tasks) for n_tasks in SIZES]
-    pairs = trained_pairs(session, here)
-    extras = session.extra_solvers
-    blocks = {EXACT_BLOCK: EXACT_COLUMNS, FULL_BLOCK: (*FULL_COLUMNS, *extras)}
+    pairs = learned_pairs(session.models, here)
+    further = (*other_columns(session.models), *session.extra_solvers)
+    blocks = {EXACT_BLOCK: EXACT_COLUMNS, FULL_BLOCK: (*FULL_COLUMNS, *further)}
     columns = [Column(column, block) for block, methods in blocks.items() for column in methods]
     heading = [Column("Number of tasks"), Column("Measure"), Column("Source")]
     table = Table(label, paper_tables()[name]["caption"], [*heading, *columns])
     notes = Notes("Gap: to the best method of the same block, in percent. Time: wall time per instance.")
     notes.add_stand_ins(session.scale, here)
     _say_how_many(session, notes)
+    notes.add(*explanations(session.models))
     errors: list[float] = []
     for scenario in here:
-        solvers = _solvers(session, scenario, pairs, notes)
+        solvers = make_solvers(session, scenario, pairs, notes)
         found = {
-            EXACT_BLOCK: _exact_block(session, scenario, solvers, notes),
-            FULL_BLOCK: _block(session, scenario, {c: s for c, s in solvers.items() if c != GUROBI}, notes),
+            EXACT_BLOCK: exact_block(session, scenario, solvers, notes).rows,
+            FULL_BLOCK: full_block(session, scenario, solvers, notes).rows,
         }
         ours = {block: _measures(found[block], methods) for block, methods in blocks.items()}
         errors += [row.standard_error for rows in found.values() for row in rows.values()]
@@ -211,59 +207,6 @@ def _results_table(session: Session, name: str, label: str, n_uavs: int) -> list
     return session.write(table, name)
 
 
-def trained_pairs(
-    session: Session, wanted: Sequence[Scenario], strategies: Sequence[str] = (ITS, INDEPENDENT)
-) -> dict[tuple[Scenario, str], Model]:
-    """
-    :param session: The session, which finds or trains the pairs
-    :param wanted: The scenarios to solve
-    :param strategies: Training strategies
-    :return: The pairs that solve the scenarios; without those that are missing and may not be trained
-    """
-    given = [(scenario, strategy) for scenario in wanted for strategy in strategies]
-    trained = dict.fromkeys((session.scale.trained_for(scenario), strategy) for scenario, strategy in given)
-    return session.models.get(trained)
-
-
-def _solvers(
-    session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
-) -> dict[str, Solver]:
-    """
-    :param session: The scale, the trained pairs, the evaluations and the output folder
-    :param scenario: The scenario to solve
-    :param pairs: The trained pairs
-    :param notes: Receives what is left out
-    :return: The solvers by column
-    """
-    found: dict[str, Solver] = {}
-    trained = session.scale.trained_for(scenario)
-    independent, ours = pairs.get((trained, INDEPENDENT)), pairs.get((trained, ITS))
-    for solver, column in BASELINES.items():
-        if solver not in session.solvers:
-            notes.add(f"{column} was not requested (--solvers).")
-        elif solver != "kmeans-am":
-            found[column] = session.evaluator.baseline(solver)
-        elif independent is not None:
-            found[column] = session.evaluator.baseline(solver, independent)
-    if KMEANS_AM in found:
-        notes.add(
-            f"{KMEANS_AM} uses the router of DL-DRL-I, which is trained on whole uniform instances only, for as many "
-            "epochs as that of DL-DRL."
-        )
-    for column, model, sampling in (
-        (INDEPENDENT_GREEDY, independent, False),
-        (INDEPENDENT_SAMPLING, independent, True),
-        (GREEDY, ours, False),
-        (SAMPLING, ours, True),
-    ):
-        if model is not None:
-            found[column] = session.evaluator.pair(model, sampling)
-        else:
-            notes.add(f"{column.split()[0]} has no trained pair for {trained.name}, and --no-training forbids training one.")
-    found |= {solver: session.evaluator.baseline(solver) for solver in session.extra_solvers}
-    return found
-
-
 def _say_how_many(session: Session, notes: Notes) -> None:
     scale = session.scale
     counts = ", ".join(f"{scale.n_instances[size]} (N = {size})" for size in SIZES)
@@ -282,29 +225,6 @@ def _say_how_exact(errors: Sequence[float], notes: Notes) -> None:
             f"Our instances are not the paper's: the standard errors of our mean objectives go up to {max(known):.2f}. "
             "Methods of the same block solve the same instances, and are comparable more precisely."
         )
-
-
-def _exact_block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """Summaries of the solvers of the exact block, by column."""
-    scale = session.scale
-    chosen = {column: solvers[column] for column in EXACT_COLUMNS if column in solvers}
-    if GUROBI in chosen:
-        notes.add(f"{GUROBI}: ours is the paper's model, equations (1) to (8), solved by {scale.exact_backend}.")
-        if scenario.n_tasks not in scale.exact_sizes:
-            del chosen[GUROBI]
-            left_out = ", ".join(str(size) for size in SIZES if size not in scale.exact_sizes)
-            notes.add(f"The exact solver does not run with {left_out} tasks at scale {scale.name}.")
-    instances = session.evaluator.instances(scenario, n_instances=scale.n_exact_instances)
-    results = session.evaluator.run(scenario, list(chosen.values()), instances, folder="-exact")
-    notes.add(*results.failures)
-    return {column: results.rows[solver.name] for column, solver in chosen.items() if solver.name in results.rows}
-
-
-def _block(session: Session, scenario: Scenario, solvers: Mapping[str, Solver], notes: Notes) -> dict[str, SummaryRow]:
-    """Summaries of solvers on the test instances, by column."""
-    results = session.evaluator.run(scenario, list(solvers.values()))
-    notes.add(*results.failures)
-    return {column: results.rows[solver.name] for column, solver in solvers.items() if solver.name in results.rows}
 
 
 def _measures(rows: Mapping[str, SummaryRow], methods: Sequence[str]) -> dict[str, list[float | None]]:
@@ -329,22 +249,23 @@ def table4(session: Session) -> list[Path]:
     :return: Paths of the written files
     """
     here = scenarios(LARGER_SIZES)
-    pairs = trained_pairs(session, here)
-    methods = (*LARGER_METHODS, *session.extra_solvers)
+    pairs = learned_pairs(session.models, here)
+    methods = larger_methods(session)
     columns = [Column(title, f"N={size}") for size in LARGER_SIZES for title in ("Obj.", "Time(s)")]
     heading = [Column("Fleet"), Column("Method"), Column("Source")]
     table = Table("Table IV", paper_tables()["table4"]["caption"], [*heading, *columns])
     labels = dict.fromkeys(model.label for model in pairs.values())
     notes = Notes(
-        f"DL-DRL and DL-DRL-I: sampling, with the pairs {', '.join(labels) or '(none)'} (the paper's: U4-500, U6-500).",
+        f"Learned methods: sampling, with the pairs {', '.join(labels) or '(none)'} (the paper's: U4-500, U6-500).",
         "The paper's table ends at 1000 tasks. Time: wall time per instance.",
     )
     notes.add_stand_ins(session.scale, [])
+    notes.add(*explanations(session.models))
     counts = ", ".join(f"{session.scale.n_instances[size]} (N = {size})" for size in LARGER_SIZES)
     notes.add(f"Our instances: {counts}; the paper does not say how many it has.")
     errors: list[float] = []
     for n_uavs in dict.fromkeys(scenario.n_uavs for scenario in here):
-        ours = {size: _larger(session, Scenario(n_uavs, size), pairs, notes) for size in LARGER_SIZES}
+        ours = {size: larger_block(session, Scenario(n_uavs, size), pairs, notes).rows for size in LARGER_SIZES}
         errors += [row.standard_error for rows in ours.values() for row in rows.values()]
         found = {
             _OURS: {
@@ -364,7 +285,7 @@ def table4(session: Session) -> list[Path]:
         }
         for position, method in enumerate(methods):
             for source in (_PAPER, _OURS):
-                if source == _PAPER and method in session.extra_solvers:
+                if source == _PAPER and method not in LARGER_METHODS:
                     continue
                 cells = [f"U{n_uavs}", method, source]
                 for size in LARGER_SIZES:
@@ -378,18 +299,26 @@ def table4(session: Session) -> list[Path]:
     return session.write(table, "table4")
 
 
-def _larger(
-    session: Session, scenario: Scenario, pairs: Mapping[tuple[Scenario, str], Model], notes: Notes
-) -> dict[str, SummaryRow]:
-    """Summaries of the methods of Table IV, by name."""
-    columns = {"DL-DRL-I": INDEPENDENT_SAMPLING, "DL-DRL": SAMPLING}
-    all_solvers = _solvers(session, scenario, pairs, Notes())
-    solvers = {
-        method: all_solvers[column]
-        for method in (*LARGER_METHODS, *session.extra_solvers)
-        if (column := columns.get(method, method)) in all_solvers
-    }
-    for method in LARGER_METHODS:
-        if method not in solvers:
+def larger_methods(session: Session) -> list[str]:
+    """
+    :param session: The trained pairs and the solvers
+    :return: The rows of Table IV
+    """
+    return [*LARGER_METHODS, *other_methods(session.models), *session.extra_solvers]
+
+
+def larger_block(session: Session, scenario: Scenario, pairs: Pairs, notes: Notes) -> Block:
+    """
+    :param session: The scale, the trained pairs, the evaluations and the output folder
+    :param scenario: The scenario to solve
+    :param pairs: The trained pairs by scenario and method
+    :param notes: Receives what is left out
+    :return: Results of the methods of Table IV
+    """
+    learned = learned_methods(session.models)
+    all_solvers = make_solvers(session, scenario, pairs, Notes())
+    names = {method: column(method, sampling=True) if method in learned else method for method in larger_methods(session)}
+    for method, name in names.items():
+        if name not in all_solvers:
             notes.add(f"{method} was not requested (--solvers), or --no-training forbids training its pair.")
-    return _block(session, scenario, solvers, notes)
+    return Block.run(session, scenario, {m: all_solvers[name] for m, name in names.items() if name in all_solvers}, notes)

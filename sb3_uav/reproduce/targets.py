@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sb3_uav.reproduce.session import Session
 
-TARGETS = ("table1", "table2", "table3", "table4", "fig3", "fig4", "fig5", "fig6", "fig7")
+TARGETS = ("table1", "table2", "table3", "table4", "fig3", "fig4", "fig5", "fig6", "fig7", "claims")
 DEFAULT_SOLVERS = ("milp", "ortools", "kmeans-vnd", "kmeans-am")
 
 
 def target_functions() -> dict[str, Callable[[Session], list[Path]]]:
-    """:return: The functions that make the tables and figures, by name"""
-    from sb3_uav.reproduce import figures_3_to_7, tables_1_to_4
+    """:return: The functions that make the tables, figures and claims, by name"""
+    from sb3_uav.reproduce import claims_tables, figures_3_to_7, tables_1_to_4
 
-    modules = (tables_1_to_4, figures_3_to_7)
-    return {name: getattr(modules[0] if name.startswith("table") else modules[1], name) for name in TARGETS}
+    modules = {"t": tables_1_to_4, "f": figures_3_to_7, "c": claims_tables}
+    return {name: getattr(modules[name[0]], name) for name in TARGETS}
 
 
 def check_solvers(names: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_uav.common.callback_tree import siblings
-from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, log_text
+from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, Moment, log_text
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
@@ -132,7 +131,7 @@ class ITSCallback(RouterCallback):
         self._started = False
         self._share = 1.0
         self._warm_started = warm_start is None
-        self._epoch_start = 0.0
+        self._epoch_start = Moment.now()
         self._epoch_first_batch = 0
         self._instances_at_start = 0
         self._instances_before = 0
@@ -243,7 +242,7 @@ class ITSCallback(RouterCallback):
 
     def _begin_epoch(self) -> None:
         assert self.instances_per_epoch is not None
-        self._epoch_start = time.time()
+        self._epoch_start = Moment.now()
         n_batches = getattr(self.model, "n_batches", 0)
         if self._epoch_is_over():
             # The last batch also completed this epoch; both share its episodes and its instances.
@@ -347,7 +346,7 @@ class ITSCallback(RouterCallback):
         if phase == PRETRAINING:
             _, size = self.schedule.pretraining_of(self._share, size)
         for index in range(first, n_epochs):
-            start, number = time.time(), 1 + n_router_epochs(self.records)
+            start, number = Moment.now(), 1 + n_router_epochs(self.records)
             generated_before = self._generation_seconds()
             statistics = EpisodeStatistics()
             description = f"router, {phase} {index + 1}/{n_epochs}"
@@ -378,10 +377,10 @@ class ITSCallback(RouterCallback):
     # ------------------------------------------------------------------------------------------------------ files
 
     def _record(
-        self, level: str, epoch: int, phase: str, n_instances: int, objective: float, start: float, generation: float = 0.0
+        self, level: str, epoch: int, phase: str, n_instances: int, objective: float, start: Moment, generation: float = 0.0
     ) -> None:
-        seconds, generation = round(time.time() - start, 3), round(generation, 3)
-        record = EpochRecord(epoch, level, phase, n_instances, objective, seconds, generation)
+        passed = start.since()
+        record = EpochRecord(epoch, level, phase, n_instances, objective, passed.wall, round(generation, 3), passed.cpu)
         self.records.append(record)
         self.logger.record(f"its/{level}_epoch", epoch)
         self.logger.record(f"its/{level}_objective", objective)

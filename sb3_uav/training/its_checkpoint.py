@@ -131,7 +131,7 @@ def _is_record(record: Any) -> bool:
     except TypeError:
         return False
     texts, counts = (made.level, made.phase), (made.epoch, made.n_instances)
-    numbers = (made.objective, made.seconds, made.generation_seconds)
+    numbers = (made.objective, made.seconds, made.generation_seconds, made.cpu_seconds)
     return (
         all(isinstance(text, str) for text in texts)
         and all(_is_count(count) for count in counts)
