@@ -294,6 +294,15 @@ def test_hyperparameters_of_both_levels(tmp_path: Path) -> None:
     assert metrics == {"eval/fixed_greedy", "eval/fixed_sampled", "eval/fixed_best"} <= scalars(tmp_path).keys()
 
 
+def test_the_order_of_the_callbacks_does_not_matter(tmp_path: Path) -> None:
+    """The router is made by the other callback, when the training starts."""
+    model, its = make_allocator(), make_its(n_epochs=1, save_path=str(tmp_path / "zips"))
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(10**9, callback=[make_callback(eval_freq=None, save_path=tmp_path), its])
+    (line,), _ = shown_hyperparameters(tmp_path)
+    assert line["router/algo"] == "REINFORCE" and line["its/n_epochs"] == 1
+
+
 def test_hyperparameters_of_ppo(tmp_path: Path) -> None:
     """Its constructor makes schedules of numbers; without sampling there is no such value."""
     model = make_model(PPO, "routing", policy_kwargs=dict(NETWORK, preset="paper"))

@@ -153,7 +153,7 @@ class FixedSetEvalCallback(BestPairOwner):
         self._learned_steps = 0
         self._evaluated_epoch = 0
         self._evaluated_updates = 0
-        self._described_in = ""
+        self._described_in: str | None = ""
         self._fingerprint = ""
         # A clock that stands still during evaluations: wall and CPU seconds when it showed 0.
         self._clock_start = np.zeros(2)
@@ -204,9 +204,6 @@ class FixedSetEvalCallback(BestPairOwner):
         self._evaluated_updates = n_updates(self.model)
         self._note_state(self._now() - self._clock_start)
         self._ready = True
-        if self._described_in != self.logger.dir:
-            self._describe()
-            self._described_in = self.logger.dir or ""
 
     def _describe(self) -> None:
         """Record the settings of the training, for TensorBoard."""
@@ -429,6 +426,9 @@ class FixedSetEvalCallback(BestPairOwner):
             self.logger.record(f"size_grid/{name}", mean)
 
     def _report(self, result: FixedSetResult, improved: bool) -> None:
+        if self._described_in != self.logger.dir:
+            self._describe()
+            self._described_in = self.logger.dir
         text = f"greedy {result.greedy.mean():.2f}"
         self.logger.record("eval/fixed_greedy", float(result.greedy.mean()))
         if self.n_samples > 0:
