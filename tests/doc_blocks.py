@@ -78,6 +78,7 @@ RULES = [
     Rule("docs/comparison/*/report.md", r"--eval-freq \d+", "--eval-freq 160"),
     Rule("docs/comparison/*/report.md", r"--seeds [\d ]+", "--seeds 0 "),
     Rule("docs/comparison/*/report.md", r"(sb3-uav compare (?!.*--variants).*)", r"\1 --variants small/variants.yml"),
+    Rule("docs/comparison/router/report.md", r" --report-only", ""),
     Rule("docs/comparison/*_long/report.md", r"--variants long\.yml", "--variants small/reinforce_alone.yml"),
     Rule("docs/comparison/*_ppo/report.md", r"--variants ppo\.yml", "--variants small/ppo_alone.yml"),
     Rule("docs/comparison/*_*/report.md", r"--router allocator/router\.zip", "--router small/router.zip"),
