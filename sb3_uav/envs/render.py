@@ -175,27 +175,19 @@ class MapFigure:
         :param episodes: Running episodes
         :param row: Index of the episode to draw
         """
-        self.draw_routes(episodes.instances, row, episodes.routes(row), stage=episodes.stage(row))
+        self.draw_routes(episodes.instances[row], episodes.routes(row), episodes.stage(row))
 
-    def draw_routes(
-        self,
-        instances: Instances,
-        row: int,
-        routes: Sequence[Sequence[int]],
-        title: str = "",
-        stage: Stage = Stage.FINISHED,
-    ) -> None:
+    def draw_routes(self, instance: Instances, routes: Sequence[Sequence[int]], stage: Stage, title: str = "") -> None:
         """
-        Replace what is drawn; the arguments are those of :func:`draw_map`.
+        Replace what is drawn.
 
-        :param instances: The instances
-        :param row: Index of the instance
+        :param instance: A batch of one
         :param routes: Task indices from 0 per UAV
-        :param title: Title of the map
         :param stage: Stage of the episode
+        :param title: Title of the map
         """
         self.axes.clear()
-        draw_map(self.axes, instances, row, routes, title, stage)
+        draw_map(self.axes, instance, 0, routes, title, stage)
         # Not tight_layout, which starts from the last layout and cuts off long legends.
         legend = 2 * _MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
         self.figure.subplots_adjust(

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.problem import Problem
+from sb3_uav.envs.problem import Problem, Stage
 from sb3_uav.envs.render import MapFigure
 from sb3_uav.policies.base import EpisodicPolicy
 
@@ -35,5 +35,5 @@ def greedy_map(policy: EpisodicPolicy, problem: Problem, instance: Instances) ->
         policy.set_training_mode(was_training)
     figure = MapFigure()
     total = float(instance.values[instance.task_mask].sum())
-    figure.draw_routes(arranged, 0, routes, title=f"greedy: objective {objective:g} of {total:g}")
+    figure.draw_routes(arranged, routes, Stage.FINISHED, f"greedy: objective {objective:g} of {total:g}")
     return figure.rgb_array()

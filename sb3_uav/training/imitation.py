@@ -46,6 +46,7 @@ def imitate(
     learning_rate: float = 2e-3,
     report: Callable[[str], None] = lambda _: None,
     folder: str | Path | None = None,
+    share: float = 1.0,
     record: Callable[[int, float], None] = lambda n_moves, nats: None,
 ) -> None:
     """
@@ -65,6 +66,7 @@ def imitate(
     :param report: Called with a line of text about the progress
     :param folder: Folder for the progress. Calling again with the same arguments resumes from it, with the same result as
         without an interruption
+    :param share: Part of ``n_subsets`` and ``n_updates`` to do, above 0 and at most 1
     :param record: Called as often with the number of moves learned from so far, those before an interruption included, and
         the mean loss since the last call in nats per move
     :raises ImportError: If numba is not installed
@@ -74,6 +76,7 @@ def imitate(
     check_counts(1, n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size)
     if not learning_rate > 0:
         raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
+    n_subsets, n_updates = math.ceil(share * n_subsets), math.ceil(share * n_updates)
     settings = dict(n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size, learning_rate=learning_rate)
     progress = None if folder is None else ImitationProgress(Path(folder), settings)
     lessons = _search_lessons(allocator, generator, rng, n_subsets, batch_size, report, progress)
