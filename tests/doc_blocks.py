@@ -1,5 +1,5 @@
 """
-The code blocks of the pages, and how tests run them: as they stand, or smaller by the rules below.
+The code blocks of the pages, and how tests run them: as they stand, or smaller by ``RULES``; without the lines of ``NOT_RUN``.
 
 A page's blocks run in their order, in one folder. Python blocks share their variables; every command line has a process of its
 own. A block whose first line is the comment ``# NAME.py`` or ``# NAME.yml`` is also the file of that name for those after it.
@@ -44,12 +44,29 @@ class Rule(NamedTuple):
     after: str
 
 
+class NotRun(NamedTuple):
+    """
+    Lines that the tests leave out; every entry must leave out one.
+
+    :param page: Pages, as a pattern of file names
+    :param line: Regular expression of the beginning of a line, continued lines joined
+    :param reason: Why they cannot run, not even smaller
+    """
+
+    page: str
+    line: str
+    reason: str
+
+
+NOT_RUN = [
+    NotRun("README.md", r"pip install -c", "it installs packages into the environment of the tests"),
+    NotRun("CONTRIBUTING.md", r"make install", "it creates an environment and installs packages"),
+]
+
 _NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
 _SMALL = "--conf-file small/{}.yml -n 1280 --num-threads 1"
 RULES = [
-    # They install packages and never end, respectively.
-    Rule("README.md", r"pip install -c .*\n", ""),
-    Rule("CONTRIBUTING.md", r"make install .*\n", ""),
+    # A server, which never ends.
     Rule("*", r"tensorboard --logdir (\S+)", r"tensorboard --logdir \1 --inspect"),
     # Smaller data, networks and budgets.
     Rule("README.md", r"rand\(16, ", "rand(2, "),
@@ -132,12 +149,12 @@ def code_blocks(page: str) -> list[tuple[str, str]]:
     return [(language, block.replace("\\\n", " ")) for language, block in found if language in CODE]
 
 
-def smaller(page: str, text: str, used: set[Rule] | None = None) -> str:
+def smaller(page: str, text: str, used: set[Any] | None = None) -> str:
     """
     :param page: A page
     :param text: A block of it
     :param used: Receives the rules that changed the block
-    :return: What the tests run
+    :return: The block, changed by the rules
     """
     for rule in RULES:
         if fnmatch(page, rule.page):
@@ -147,10 +164,25 @@ def smaller(page: str, text: str, used: set[Rule] | None = None) -> str:
     return text
 
 
+def without_lines(page: str, text: str, used: set[Any] | None = None) -> str:
+    """
+    :param page: A page
+    :param text: A block of it
+    :param used: Receives the entries of ``NOT_RUN`` that left out a line
+    :return: The block without these lines
+    """
+    for entry in NOT_RUN:
+        if fnmatch(page, entry.page):
+            text, n_changes = re.subn(rf"^{entry.line}.*\n?", "", text, flags=re.MULTILINE)
+            if n_changes > 0 and used is not None:
+                used.add(entry)
+    return text
+
+
 def blocks_to_run(page: str) -> Iterator[Block]:
-    """The blocks of a page of which the rules leave something."""
+    """The blocks of a page that are not left out as a whole."""
     for number, (language, text) in enumerate(code_blocks(page), start=1):
-        left = smaller(page, text)
+        left = smaller(page, without_lines(page, text))
         if left.strip():
             yield Block(page, number, language, left)
 
