@@ -16,7 +16,9 @@ from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, l
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
+from sb3_uav.common.router_progress import router_progress
 from sb3_uav.common.sb3_compat import n_updates, total_timesteps
+from sb3_uav.common.shared_axis import SharedAxis
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
@@ -36,7 +38,6 @@ from sb3_uav.training.its_checkpoint import (
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
 from sb3_uav.training.router_handover import hand_over_router
-from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import find_run_folder
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_large_batches
@@ -62,15 +63,18 @@ class ITSCallback(RouterCallback):
     ``checkpoint_freq``-th one of the allocator. With ``REINFORCE`` and constant learning rates (``lr_decay`` included) a
     resumed run ends with the same result as an uninterrupted one.
 
+    Both levels log on one axis, that of the steps that either of them has learned from: environment steps, and in the warm
+    start the moves that are imitated. The router's TensorBoard events are in the folder ``router`` of the allocator's.
+
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
     :param warm_start: What trains the router before anything else: arguments of
         :func:`~sb3_uav.training.imitation.imitate`, as in ``{"n_updates": 1000}``; or the dotted path of another function and
         its arguments, as in ``{"my_package.start": {"n_steps": 10}}``. It is called with the policies of router and
-        allocator, the generator of the instances and a random generator. If it has the parameters ``report`` and ``folder``,
-        it gets a function to report its progress to, and a folder to keep it in (None without ``save_path``), from which an
-        interrupted run resumes; the folder is removed afterwards. If it has a parameter ``share``, it gets the part of the
-        planned steps that this run takes
+        allocator, the generator of the instances and a random generator. If it has the parameters ``report``, ``record`` and
+        ``folder``, it gets a function to report its progress to, one to log its loss with, and a folder to keep its progress
+        in (None without ``save_path``), from which an interrupted run resumes; the folder is removed afterwards. If it has a
+        parameter ``share``, it gets the part of the planned steps that this run takes
     :param n_epochs: Allocator epochs (the paper's E)
     :param n_pretraining_epochs: Router epochs of pre-training (E_p)
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
@@ -127,6 +131,7 @@ class ITSCallback(RouterCallback):
         self.epoch = 0
         self._trainer: RouterTrainer
         self._allocator_freezer: Freezer
+        self._axis = SharedAxis()
         self._statistics = EpisodeStatistics()
         self._subsets: AllocatedSubsets | None = None
         self._started = False
@@ -158,7 +163,10 @@ class ITSCallback(RouterCallback):
         self.instances_per_epoch = find_epoch_size(self.model, self.instances_per_epoch)
         if self.save_path is None:
             self.save_path = self._find_save_path()
-        if not self._started:
+        self._axis.begin(self.model)
+        if self._started:
+            self._axis.join(lambda: self.router)
+        else:
             # Before anything is drawn or saved, so that an unseeded run draws a seed and every zip of it has that seed.
             self._seed()
             warn_of_large_batches(self.model, self.instances_per_epoch, self.problem.generator.n_tasks)
@@ -202,6 +210,7 @@ class ITSCallback(RouterCallback):
                 "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
                 f"{CHECKPOINT_FOLDER} folder of the earlier run."
             )
+        self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
             self._start_router(self.warm_start)
         self._warm_started = True
@@ -213,9 +222,15 @@ class ITSCallback(RouterCallback):
             if self.verbose > 0:
                 print(text, flush=True)
 
+        def record(n_moves: int, nats: float) -> None:
+            self._axis.extra = n_moves
+            self.router.logger.record("imitation/nats_per_move", nats)
+            self.router.logger.dump(self.router.num_timesteps)
+
         folder = None if self.save_path is None else self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
         positional = (self._trainer.policy, self.model.policy, self.problem.generator, rng)
-        start = warm_start.bind(positional, {"report": report, "folder": folder, "share": self._share})
+        offered = {"report": report, "record": record, "folder": folder, "share": self._share}
+        start = warm_start.bind(positional, offered)
         if folder is not None:
             bring_progress(folder, None if self.resume_from is None else self.resume_from / WARM_START_FOLDER)
         # From here on an interrupted run can be resumed.
@@ -259,6 +274,7 @@ class ITSCallback(RouterCallback):
             self._end_epoch()
 
     def _on_step(self) -> bool:
+        self._axis.note()
         self._statistics.count(self.locals)
         return self.epoch < self.n_epochs
 
@@ -385,6 +401,10 @@ class ITSCallback(RouterCallback):
         self.records.append(record)
         self.logger.record(f"its/{level}_epoch", epoch)
         self.logger.record(f"its/{level}_objective", objective)
+        if level == "router":
+            # At its own step: the allocator may not log before several of these epochs are over.
+            self.logger.dump(self.model.num_timesteps)
+        self._axis.note()
         if self.verbose > 0:
             print(f"{level} epoch {epoch} ({phase}): mean objective {objective:.2f}, {record.seconds:.1f} s")
         if self.save_path is not None:
@@ -396,6 +416,7 @@ class ITSCallback(RouterCallback):
 
     def _save_checkpoint(self) -> None:
         """Write both levels' zips and the state of the strategy."""
+        self._axis.note()
         self._save_router()
         if self.save_path is not None:
             folder = self.save_path / CHECKPOINT_FOLDER
