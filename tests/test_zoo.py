@@ -314,7 +314,8 @@ def test_shipped_routers_build(name):
     for router in [its_of(entry)["router"] for entry in entries.values()]:
         settings = {key: value for key, value in router.items() if key not in ("algo", "n_envs", "policy")}
         assert router["algo"] == ("reinforce" if name == "paper" else name) and router["policy"] == "RouterPolicy"
-        resolve_algorithm(router["algo"])(RouterPolicy, env, device="cpu", **settings)
+        algorithm: Any = resolve_algorithm(router["algo"])
+        algorithm(RouterPolicy, env, device="cpu", **settings)
 
 
 def test_texts_become_numbers():
