@@ -61,7 +61,7 @@ def fits(stored: StoredPolicy, observation_space: spaces.Space, action_space: sp
         needed = environment_name(stored.policy_class)
         found = "TaskAllocation" if is_router else "RoutePlanning"
         raise ValueError(
-            f"{stored.file}: holds a {stored.policy_class.__name__}, which needs a {needed} environment, but this one is a "
+            f"{stored.file}: holds {stored.policy_class.__name__}, which needs a {needed} environment, but this one is a "
             f"{found} environment; give the zip of the {'allocator' if is_router else 'router'}, or a {needed} environment."
         )
     if not is_router and stored.n_uavs not in (None, problem.generator.n_uavs):

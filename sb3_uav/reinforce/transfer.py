@@ -25,7 +25,7 @@ __all__ = ["fine_tuning_settings", "load", "own_spaces", "require_fit"]
 _LEARNING_RATE = 1e-4
 # Steps between two updates of a router's environment: two or three tours.
 _ROUTER_STEPS = 40
-_N_MINIBATCHES = 4
+_MAX_MINIBATCHES = 4
 
 
 def load(
@@ -92,7 +92,7 @@ def require_fit(path: str | os.PathLike[str], env: Env[Any, Any] | VecEnv) -> St
     stored = read_policy(path)
     if not fits(stored, env.observation_space, env.action_space):
         raise ValueError(
-            f"{stored.file}: a {stored.policy_class.__name__} needs a {environment_name(stored.policy_class)} environment, "
+            f"{stored.file}: {stored.policy_class.__name__} needs a {environment_name(stored.policy_class)} environment, "
             f"found the spaces {env.observation_space!s:.200} and {env.action_space}; make one of this package, of any size."
         )
     return stored
@@ -104,7 +104,7 @@ def fine_tuning_settings(algorithm: str | type[OnPolicyAlgorithm], env: Env[Any,
 
     - ``REINFORCE``: 8 samples per instance with their mean as the baseline, advantages normalized;
     - ``PPO`` and ``MaskablePPO``: rollouts of whole episodes of the allocator (``n_steps`` is the number of tasks) or of 40
-      steps of the router, 4 minibatches and 4 epochs, no discount, ``vf_coef`` 0.05 as returns count tasks;
+      steps of the router, up to 4 equal minibatches and 4 epochs, no discount, ``vf_coef`` 0.05 as returns count tasks;
     - others: the same rollouts, no discount.
 
     :param algorithm: As of :func:`load`
@@ -123,5 +123,7 @@ def fine_tuning_settings(algorithm: str | type[OnPolicyAlgorithm], env: Env[Any,
     settings: dict[str, Any] = dict(learning_rate=_LEARNING_RATE, n_steps=n_steps, gamma=1.0, gae_lambda=0.98, vf_coef=0.05)
     if issubclass(cls, PPO | MaskablePPO):
         n_rows = n_steps * (env.num_envs if isinstance(env, VecEnv) else 1)
-        settings |= dict(batch_size=max(-(-n_rows // _N_MINIBATCHES), 2), n_epochs=4)
+        # As many as divide a rollout into equal ones, which SB3 asks for.
+        n_batches = next(n for n in range(_MAX_MINIBATCHES, 0, -1) if n_rows % n == 0)
+        settings |= dict(batch_size=n_rows // n_batches, n_epochs=4)
     return settings
