@@ -135,7 +135,8 @@ def test_foreign_environments_are_refused_as_by_sb3(tmp_path: Path) -> None:
     class Extended(TaskAllocationEnv):
         def __init__(self) -> None:
             super().__init__(8)
-            self.observation_space = gym.spaces.Dict({**self.observation_space.spaces, "wind": gym.spaces.Box(0, 1, (2,))})
+            known = self.problem.observation_space.spaces
+            self.observation_space = gym.spaces.Dict({**known, "wind": gym.spaces.Box(0, 1, (2,))})
 
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         REINFORCE.load(tmp_path / "model.zip", env=Extended())
@@ -229,7 +230,7 @@ def test_transfer_unpickles_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("algorithm", ["reinforce", "ppo", "a2c", "ppo_mask"])
 def test_shipped_pair_predicts_and_learns(algorithm: str) -> None:
     env = make_env("allocator", 12, 3)
-    short = dict(n_epochs=1) if algorithm.startswith("ppo") else {}
+    short: dict[str, Any] = dict(n_epochs=1) if algorithm.startswith("ppo") else {}
     model = pretrained.load("universal", level="allocator", env=env, algorithm=algorithm, device="cpu", seed=0, **short)
     check_plays_as_the_zip(model, pretrained.files()[0], "allocator", 12, 3)
     router = env.get_attr("problem")[0].router

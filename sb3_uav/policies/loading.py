@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_uav.policies.allocator import AllocatorPolicy
@@ -59,6 +60,20 @@ class StoredPolicy:
         :raises NotOurPolicyError: If some of it is stored as a pickle
         """
         return _plain_policy_kwargs(self.attributes, self.file)
+
+    def build(
+        self, observation_space: spaces.Space, action_space: spaces.Space, device: th.device | str = "cpu"
+    ) -> EpisodicPolicy:
+        """
+        :param observation_space: Observation space of an environment of the policy's level, of any size
+        :param action_space: Its action space
+        :param device: Device of the policy
+        :return: The policy for the step loop of that environment, in evaluation mode
+        """
+        policy = self.policy_class(observation_space, action_space, lambda _: 0.0, **self.policy_kwargs)
+        policy.load_state_dict(self.parameters)
+        policy.set_training_mode(False)
+        return policy.to(device)
 
     @property
     def n_uavs(self) -> int | None:
