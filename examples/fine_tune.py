@@ -21,9 +21,11 @@ from sb3_uav.solvers import make_solver
 from sb3_uav.training import ITSCallback
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--epochs", type=int, default=20, help="default: %(default)s")
+parser.add_argument("--epochs", type=int, default=30, help="default: %(default)s")
+parser.add_argument("--learning-rate", type=float, default=1e-4, help="default: %(default)s")
 parser.add_argument("--instances-per-epoch", type=int, default=128, help="default: %(default)s")
-parser.add_argument("--held-out", type=int, default=96, metavar="N", help="instances to measure on, default: %(default)s")
+parser.add_argument("--held-out", type=int, default=512, metavar="N", help="instances to measure on, default: %(default)s")
+parser.add_argument("--decode", nargs="+", default=["greedy"], help="greedy and/or sampling, default: greedy")
 parser.add_argument("--out", type=Path, default=Path("fine_tuned"), help="folder of the zips, default: %(default)s")
 args = parser.parse_args()
 
@@ -31,9 +33,10 @@ env = make_vec_env(
     "TaskAllocation-U4-N80-v0", n_envs=16, seed=1, env_kwargs=dict(distribution="clustered"), vec_env_cls=BatchedVecEnv
 )
 n = args.instances_per_epoch
-model = pretrained.load("universal", env=env, instances_per_epoch=n, seed=1)
+model = pretrained.load("universal", env=env, instances_per_epoch=n, learning_rate=args.learning_rate, seed=1)
+router = {"pretrained": "universal", "learning_rate": args.learning_rate}
 its = ITSCallback(
-    "universal", args.epochs, router_instances_per_epoch=4 * n, strategy="alternate-only", save_path=str(args.out), verbose=1
+    router, args.epochs, router_instances_per_epoch=4 * n, strategy="alternate-only", save_path=str(args.out), verbose=1
 )
 model.learn(args.epochs * n * 8 * 80, callback=its)
 model.save(args.out / "allocator.zip")
@@ -41,7 +44,7 @@ model.save(args.out / "allocator.zip")
 # Training draws from random streams of its own seed; these instances come from another one.
 instances = ClusteredGenerator(80, n_uavs=4)(args.held_out, np.random.default_rng(2_000_000))
 tuned = f"allocator={args.out / 'allocator.zip'},router={args.out / 'router.zip'}"
-for decode in ("greedy", "sampling"):
+for decode in args.decode:
     objectives = []
     for pair in ("allocator=universal", tuned):
         results = make_solver(f"dl-drl:{pair},decode={decode}").solve(instances)

@@ -108,7 +108,7 @@ class AnySizeAlgorithm(OnPolicyAlgorithm):
 
     # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L634
     @classmethod
-    def load(  # type: ignore[override]  (SB3's own subclasses narrow it too)
+    def load(
         cls: type[SelfT],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,

@@ -172,7 +172,8 @@ class UAVExperimentManager(ExperimentManager):
         print(f"Starting a new run with the weights of {self._weights.zip_file}{rewards}")
         settings = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
         settings |= dict(seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device)
-        return load(self._weights.zip_file, env, rl_zoo3.ALGOS[self.algo], **settings)
+        algorithm: Any = rl_zoo3.ALGOS[self.algo]
+        return load(self._weights.zip_file, env, algorithm, **settings)
 
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
