@@ -146,11 +146,12 @@ class RouterTrainer:
         set_last_observation(self.algorithm, observation)
         self.freezer = Freezer(self.policy)
 
-    def learn(self, number: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
+    def learn(self, size: int, planned: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
         """
         Let the router learn for one epoch.
 
-        :param number: Number of the epoch, from 1
+        :param size: Instances of the epoch
+        :param planned: Instances of all epochs up to this one
         :param statistics: Counts its episodes
         :param others: More callbacks
         :return: How many instances it learned from
@@ -158,14 +159,14 @@ class RouterTrainer:
         callback = CallbackList([statistics, *others])
         if isinstance(self.algorithm, REINFORCE):
             before = self.algorithm.n_instances
-            # Up to a multiple of the epoch's size, so that rounding up to whole batches does not add epochs.
-            self.algorithm.learn_instances(number * self.epoch_size - before, callback)
+            # Up to the planned sum, so that rounding up to whole batches does not add epochs.
+            self.algorithm.learn_instances(planned - before, callback)
             return self.algorithm.n_instances - before
         # SB3 keeps the last observation of the previous generator's instances otherwise.
         forget_last_observation(self.algorithm)
         # Whole rollouts, because SB3 throws away one that a callback stops.
         steps = self.algorithm.n_steps * self.algorithm.n_envs
-        while statistics.n_episodes < self.epoch_size:
+        while statistics.n_episodes < size:
             self.algorithm.learn(steps, callback, reset_num_timesteps=False)
         return statistics.n_episodes
 
