@@ -92,19 +92,8 @@ def test_both_levels_evaluated_and_drawn(tmp_path):
 
 @pytest.mark.slow
 def test_fine_tune(tmp_path):
-    printed = run(
-        "fine_tune",
-        tmp_path,
-        "--epochs",
-        "1",
-        "--instances-per-epoch",
-        "16",
-        "--held-out",
-        "3",
-        "--decode",
-        "greedy",
-        "sampling",
-    )
+    small = ("--epochs", "1", "--instances-per-epoch", "16", "--held-out", "3", "--decode", "greedy", "sampling")
+    printed = run("fine_tune", tmp_path, *small)
     assert "router epoch 1 (alternate)" in printed
     changed = False
     for level, policy_class in (("allocator", AllocatorPolicy), ("router", RouterPolicy)):

@@ -253,6 +253,19 @@ def test_shipped_pair_with_another_router_and_settings(tmp_path: Path) -> None:
         assert equal(router.router.__self__.state_dict(), state(other))
 
 
+def test_settings_for_fine_tuning() -> None:
+    """The numbers of the documentation."""
+    on_policy = dict(learning_rate=1e-4, gamma=1.0, gae_lambda=0.98, vf_coef=0.05)
+    for env, n_steps, batch_size in ((TaskAllocationEnv(30), 30, 10), (RoutePlanningEnv(30), 40, 10)):
+        a2c = dict(on_policy, n_steps=n_steps)
+        assert transfer.fine_tuning_settings("a2c", env) == a2c
+        assert transfer.fine_tuning_settings("ppo", env) == dict(a2c, n_epochs=4, batch_size=batch_size)
+        expected = dict(learning_rate=1e-4, n_samples=8, baseline="shared", normalize_advantage=True, max_grad_norm=1.0)
+        assert transfer.fine_tuning_settings("reinforce", env) == expected
+    with pytest.raises(ValueError, match="env has the spaces of no environment of this package"):
+        transfer.fine_tuning_settings("ppo", gym.make("CartPole-v1"))
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
