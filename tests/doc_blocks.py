@@ -91,6 +91,7 @@ RULES = [
     Rule("docs/fine_tuning.md", r"learn\((100|50)_000\)", "learn(80)"),
     Rule("docs/fine_tuning.md", r"n_epochs: 10", "n_epochs: 1"),
     Rule("docs/fine_tuning.md", r"--epochs 29", "--epochs 1 --instances-per-epoch 16 --held-out 3"),
+    Rule("docs/fine_tuning.md", r"--held-out 96", "--held-out 4"),
     Rule("docs/fine_tuning.md", r"(sb3-uav train .*) -i", rf"\1 {_SMALL.format('reinforce')} -i"),
     Rule("docs/results/*", r"U4-N80\.npz U6-N80\.npz \.\.\. \S+", "U4-N80.npz"),
     Rule("docs/results/*", r"U4-N500\.npz U6-N200\.npz", "U4-N80.npz"),

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch as th
 from forked import run_forked
 from PIL import Image
 
