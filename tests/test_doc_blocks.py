@@ -27,6 +27,7 @@ from PIL import Image
 from sb3_uav.envs import Instances, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
+from sb3_uav.reinforce import REINFORCE
 
 # Seconds for one command.
 LIMIT = 600.0
@@ -93,7 +94,18 @@ def check_policies(folder: Path, variables: dict[str, Any]) -> None:
     assert (folder / "policy.onnx").stat().st_size > 1000
 
 
+def check_fine_tuning(folder: Path, variables: dict[str, Any]) -> None:
+    assert type(variables["model"]) is REINFORCE and type(variables["again"].policy) is RouterPolicy
+    runs = folder / "logs" / "reinforce"
+    for name in ("TaskAllocation-U4-N100-v0_1", "TaskAllocation-U4-N150-v0_1"):
+        # Of the shipped pair, not of the YAML.
+        assert load_policy(runs / name / "router.zip").settings.n_layers == 4
+    rows = (folder / "results" / "results.csv").read_text(encoding="utf-8").splitlines()
+    assert sum("sb3:zip=" in row for row in rows) == 2 * 16
+
+
 CHECKS: dict[str, Check] = {
+    "docs/fine_tuning.md": check_fine_tuning,
     "README.md": check_readme,
     "docs/training.md": check_training,
     "docs/tensorboard.md": check_tensorboard,

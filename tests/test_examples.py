@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch as th
 from forked import run_forked
 from PIL import Image
 
+from sb3_uav import pretrained
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 
@@ -87,6 +89,27 @@ def test_both_levels_evaluated_and_drawn(tmp_path):
         assert 0 < length <= 1.5
     assert objectives["DL-DRL (greedy)"] <= objectives["DL-DRL (sampling 64)"] <= 20
     assert (tmp_path / "schedule.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_fine_tune(tmp_path):
+    small = ("--epochs", "1", "--instances-per-epoch", "16", "--held-out", "3", "--decode", "greedy", "sampling")
+    printed = run("fine_tune", tmp_path, *small)
+    assert "router epoch 1 (alternate)" in printed
+    changed = False
+    for level, policy_class in (("allocator", AllocatorPolicy), ("router", RouterPolicy)):
+        tuned = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
+        changed |= not th.equal(*(p.encoder.embed_task.bias for p in (tuned.features_extractor, shipped(level))))
+    assert changed
+    for decode in ("greedy", "sampling"):
+        before, after, gain = numbers(
+            rf"{decode}: {NUMBER} tasks as shipped, {NUMBER} fine-tuned, gain (-?\d+\.\d+) \+- \d+\.\d+", printed
+        )
+        assert 30 < before <= 80 and abs(after - before - gain) < 0.011
+
+
+def shipped(level):
+    return load_policy(pretrained.files()[level == "router"]).features_extractor
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 import warnings
@@ -23,6 +24,7 @@ from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.freezing import Freezer
+from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.recognition import find_problem
 from sb3_uav.training.arguments import check_counts
@@ -45,6 +47,7 @@ from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
 ROUTER_FILE = "router.zip"
+_PRETRAINING_EPOCHS = 5
 
 
 class ITSCallback(RouterCallback):
@@ -67,7 +70,10 @@ class ITSCallback(RouterCallback):
     start the moves that are imitated. The router's TensorBoard events are in the folder ``router`` of the allocator's.
 
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
-        on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
+        on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``. Or a router that was
+        trained before, to go on with: its zip or the name of a pair such as ``"universal"``, with the settings of
+        :func:`~sb3_uav.reinforce.transfer.fine_tuning_settings`; or ``{"zip": "router.zip", ...}`` or ``{"pretrained":
+        "universal", ...}`` with other settings of the algorithm. The zip is read without unpickling
     :param warm_start: What trains the router before anything else: arguments of
         :func:`~sb3_uav.training.imitation.imitate`, as in ``{"n_updates": 1000}``; or the dotted path of another function and
         its arguments, as in ``{"my_package.start": {"n_steps": 10}}``. It is called with the policies of router and
@@ -76,7 +82,7 @@ class ITSCallback(RouterCallback):
         in (None without ``save_path``), from which an interrupted run resumes; the folder is removed afterwards. If it has a
         parameter ``share``, it gets the part of the planned steps that this run takes
     :param n_epochs: Allocator epochs (the paper's E)
-    :param n_pretraining_epochs: Router epochs of pre-training (E_p)
+    :param n_pretraining_epochs: Router epochs of pre-training (E_p); when None 5, or none for a router that was trained before
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
@@ -94,9 +100,9 @@ class ITSCallback(RouterCallback):
 
     def __init__(
         self,
-        router: dict[str, Any],
+        router: dict[str, Any] | str | os.PathLike[str],
         n_epochs: int = 100,
-        n_pretraining_epochs: int = 5,
+        n_pretraining_epochs: int | None = None,
         n_intensive_epochs: int = 8,
         n_continuous_epochs: int = 4,
         instances_per_epoch: int | None = None,
@@ -110,15 +116,15 @@ class ITSCallback(RouterCallback):
     ) -> None:
         super().__init__(verbose)
         check_counts(1, n_epochs=n_epochs, n_continuous_epochs=n_continuous_epochs, checkpoint_freq=checkpoint_freq)
+        self.router_zip, self.router_kwargs = router_source(router)
+        if n_pretraining_epochs is None:
+            n_pretraining_epochs = _PRETRAINING_EPOCHS if self.router_zip is None else 0
         check_counts(0, n_pretraining_epochs=n_pretraining_epochs, n_intensive_epochs=n_intensive_epochs)
         check_counts(1, instances_per_epoch=instances_per_epoch, router_instances_per_epoch=router_instances_per_epoch)
-        if not isinstance(router, dict) or "policy" not in router:
-            raise ValueError(f"router must be a mapping with at least the key 'policy', found {router!r:.80}.")
         self.strategy = strategy_name(strategy)
         self.schedule = EpochSchedule.of(
             self.strategy, n_epochs, n_pretraining_epochs, n_intensive_epochs, n_continuous_epochs
         )
-        self.router_kwargs = dict(router)
         self.n_epochs = n_epochs
         self.instances_per_epoch = instances_per_epoch
         self.router_instances_per_epoch = router_instances_per_epoch
@@ -199,6 +205,7 @@ class ITSCallback(RouterCallback):
             self.training_env.num_envs,
             self.problem.generator,
             self.router_instances_per_epoch or self.instances_per_epoch,
+            self.router_zip,
         )
         self._allocator_freezer = Freezer(self.model.policy)
         if self.resume_from is None:
@@ -208,7 +215,8 @@ class ITSCallback(RouterCallback):
         elif n_updates(self.model) > 0:
             raise ValueError(
                 "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
-                f"{CHECKPOINT_FOLDER} folder of the earlier run."
+                f"{CHECKPOINT_FOLDER} folder of the earlier run, or start a new one with its weights "
+                "(sb3_uav.reinforce.transfer.load) and a router that was trained before."
             )
         self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
