@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -130,10 +131,14 @@ class BatchedVecEnv(VecEnv):
         finished = result.dones.nonzero()[0]
         observation = result.observation
         if len(finished) > 0:
-            for row in finished:
+            returns = th.from_numpy(self._episode_returns[finished])[:, None]
+            successes = self.problem.successes(self.episodes.instances[finished], returns)
+            for number, row in enumerate(finished):
                 infos[row]["terminal_observation"] = {key: value[row] for key, value in observation.items()}
                 infos[row]["TimeLimit.truncated"] = False
                 infos[row]["objective"] = float(self._episode_returns[row])
+                if successes is not None:
+                    infos[row]["is_success"] = bool(successes[number])
                 infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
                 for key in self._info_keywords:
                     infos[row]["episode"][key] = infos[row][key]

@@ -53,20 +53,26 @@ class Step(NamedTuple):
     infos: list[dict[str, Any]]
 
 
-def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_steps: int) -> Iterator[Step]:
+def steps_of_episodes(
+    returns: np.ndarray, lengths: np.ndarray, n_steps: int, successes: np.ndarray | None = None
+) -> Iterator[Step]:
     """
     Distribute played episodes over the steps of a ``VecEnv``.
 
     :param returns: ``(batch,)``, episode returns
     :param lengths: ``(batch,)``, episode lengths in environment steps
     :param n_steps: Number of ``VecEnv`` steps, at least 1
+    :param successes: ``(batch,)`` bool, whether the episodes are a success; None if that is undefined
     :return: The steps; all episodes end in the last one
     """
     batch = len(returns)
     for _ in range(n_steps - 1):
         yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
-    infos = [
+    infos: list[dict[str, Any]] = [
         {"objective": episode_return, "illegal_actions": 0, "episode": {"r": episode_return, "l": length}}
         for episode_return, length in zip(returns.tolist(), lengths.tolist(), strict=True)
     ]
+    if successes is not None:
+        for info, is_success in zip(infos, successes.tolist(), strict=True):
+            info["is_success"] = is_success
     yield Step(returns.astype(np.float32), np.ones(batch, bool), infos)

@@ -270,26 +270,32 @@ class REINFORCE(OnPolicyAlgorithm):
             returns = problem.returns(instances, actions)
             baseline = self._baseline.of_episodes(problem, instances, returns)
         lengths = problem.lengths(instances, actions)
-        if not self._report_episodes(env, callback, returns.cpu().numpy(), lengths.cpu().numpy()):
+        if not self._report_episodes(env, callback, returns, lengths, problem.successes(instances, returns)):
             return False
         self._batch = EpisodeBatch(instances, cache, actions, returns, baseline)
         callback.on_rollout_end()
         return True
 
-    def _report_episodes(self, env: VecEnv, callback: BaseCallback, returns: np.ndarray, lengths: np.ndarray) -> bool:
+    def _report_episodes(
+        self, env: VecEnv, callback: BaseCallback, returns: th.Tensor, lengths: th.Tensor, successes: th.Tensor | None
+    ) -> bool:
         """
         Count the steps and call the callbacks as SB3's loop does, once per ``n_envs`` steps.
 
         :param returns: ``(batch, n_samples)``, episode returns
         :param lengths: ``(batch, n_samples)``, episode lengths in steps
+        :param successes: ``(batch, n_samples)``, whether the episodes are a success; None if that is undefined
         :return: False if a callback stops the training
         """
-        for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
+        for sample in range(returns.shape[1]):
+            sample_returns, sample_lengths = returns[:, sample].cpu().numpy(), lengths[:, sample].cpu().numpy()
+            sample_won = None if successes is None else successes[:, sample].cpu().numpy()
             n_played = int(sample_lengths.sum())
             n_calls = max(math.ceil((n_played - self.steps_ahead) / self.n_envs), 1)
             self.steps_ahead += n_calls * self.n_envs - n_played
             # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
-            for rewards, dones, infos in steps_of_episodes(sample_returns, sample_lengths, n_calls):  # noqa: B007
+            steps = steps_of_episodes(sample_returns, sample_lengths, n_calls, sample_won)
+            for rewards, dones, infos in steps:  # noqa: B007
                 self.num_timesteps += self.n_envs
                 if dones.all():
                     log_episodes(env, infos)
