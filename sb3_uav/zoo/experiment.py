@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from huggingface_sb3 import EnvironmentName
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common.random_streams import EVALUATION_SEED
@@ -17,7 +20,9 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
+from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
 
@@ -77,15 +82,34 @@ class UAVExperimentManager(ExperimentManager):
         return f"{self.config}, {self.env_name.gym_id}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        entry = self.env_name.gym_id
         if str(self.config).endswith((".yml", ".yaml")):
-            read_yaml(Path(self.config))
-        hyperparams, saved = super().read_hyperparameters()
+            entry = find_entry(read_yaml(Path(self.config)), entry, self.env_kwargs) or entry
+        with self._reading(entry):
+            hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
         check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
         hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
         check_values(hyperparams, self._where)
+        scaled = scaled_values(hyperparams, entry, self.env_name.gym_id, self.env_kwargs)
+        for key, value in scaled.items():
+            if key not in (self.custom_hyperparams or {}):
+                print(f"{key} is for another number of tasks: {hyperparams[key]} becomes {value}")
+                hyperparams[key] = saved[key] = value
         return hyperparams, saved
+
+    @contextmanager
+    def _reading(self, entry: str) -> Iterator[None]:
+        """:param entry: What rl_zoo3 reads of the YAML in the ``with`` block; it looks for the entry of its environment"""
+        env_name = self.env_name
+        if entry != env_name.gym_id:
+            print(f"{self.config} has no entry for {env_name.gym_id}; using that of {entry}")
+        self.env_name = EnvironmentName(entry)
+        try:
+            yield
+        finally:
+            self.env_name = env_name
 
     def setup_experiment(self) -> Any:
         try:
@@ -131,7 +155,7 @@ class UAVExperimentManager(ExperimentManager):
         :param hyperparams: Hyperparameters of the algorithm
         :param callbacks: Callbacks of the entry
         """
-        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
+        n_tasks = {**gym.spec(self.env_name.gym_id).kwargs, **self.env_kwargs}.get("n_tasks")
         if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
             # It replaces rl_zoo3's EvalCallback, with more than a few random episodes.
             self.eval_freq = -1
@@ -148,6 +172,10 @@ class UAVExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
+        self.callbacks = [
+            PairCheckpointCallback.of(callback) if type(callback) is CheckpointCallback else callback
+            for callback in self.callbacks
+        ]
         for callback in self.callbacks:
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)

@@ -6,10 +6,13 @@ Overridden methods of its ``ExperimentManager`` are in :mod:`sb3_uav.zoo.experim
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from sb3_uav.common.optional import install_command
@@ -56,6 +59,22 @@ def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
     :param arguments: Its arguments
     """
     with _replaced(sys, "argv", [prog, *arguments]):
+        yield
+
+
+@contextmanager
+def help_text(module: Any, description: str) -> Iterator[None]:
+    """
+    Add a description to what a command of rl_zoo3 prints for ``--help``; its parser has none.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/train.py#L23
+
+    :param module: The module of the command, which makes one parser
+    :param description: The text, printed as it is
+    """
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = partial(argparse.ArgumentParser, description=description, formatter_class=formatter, usage="%(prog)s [options]")
+    with _replaced(module, "argparse", SimpleNamespace(ArgumentParser=lambda *_: parser())):
         yield
 
 
