@@ -174,9 +174,18 @@ class MapFigure:
         :param episodes: Running episodes
         :param row: Index of the episode to draw
         """
-        routes = episodes.routes(row)
+        self.draw_routes(episodes.instances[row], episodes.routes(row), episodes.stage(row))
+
+    def draw_routes(self, instance: Instances, routes: Sequence[Sequence[int]], stage: Stage) -> None:
+        """
+        Replace what is drawn.
+
+        :param instance: A batch of one
+        :param routes: Task indices from 0 per UAV
+        :param stage: Stage of the episode
+        """
         self.axes.clear()
-        draw_map(self.axes, episodes.instances, row, routes, stage=episodes.stage(row))
+        draw_map(self.axes, instance, 0, routes, stage=stage)
         # Not tight_layout, which starts from the last layout and cuts off long legends.
         legend = 2 * _MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
         self.figure.subplots_adjust(

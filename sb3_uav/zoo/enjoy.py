@@ -14,8 +14,7 @@ _HELP = """\
 Replay a trained agent with rl_zoo3. An allocator's rewards come from the router of its run: that of the best pair with
 --load-best, that of the same moment with --load-checkpoint and --load-last-checkpoint.
 
-The defaults below are rl_zoo3's, but for these: --algo is reinforce, --folder is logs. --trust allows to replay an agent
-that load-from-hub downloaded, which unpickles it.
+The defaults below are rl_zoo3's, but for these: --algo is reinforce, --folder is logs.
 """
 
 
@@ -39,7 +38,10 @@ def enjoy(arguments: Sequence[str]) -> None:
     arguments, trust = without_flag(arguments, "--trust")
     chosen, _ = agent_parser().parse_known_args(arguments)
     if chosen.help:
-        with command_line(_PROG, ["--help"]), help_text(rl_zoo3.enjoy, _HELP):
+        with (
+            command_line(_PROG, ["--help"]),
+            help_text(rl_zoo3.enjoy, _HELP, "--trust", "replay an agent that load-from-hub downloaded"),
+        ):
             rl_zoo3.enjoy.enjoy()
     make_env = environment_of(find_agent(chosen, trust))
     flags = ["--algo", chosen.algo, "-f", chosen.folder, *arguments]

@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import create_test_env, get_model_path
 from stable_baselines3.common.vec_env import VecEnv
@@ -21,6 +22,7 @@ from sb3_uav.training.best_pair import find_best_router
 from sb3_uav.training.its import ROUTER_FILE
 from sb3_uav.zoo.checkpoints import find_checkpoint_router
 from sb3_uav.zoo.experiment import make_batched_vec_env
+from sb3_uav.zoo.saved import saved_env_kwargs
 from sb3_uav.zoo.trust import require_trust
 
 
@@ -88,6 +90,17 @@ def _find_router(run_folder: Path, model: Path, best: bool) -> Path | None:
         if model.name.startswith("rl_model_"):
             print(f"{model.name} has no router of its own: rewards come from the run's last one.")
     return found
+
+
+def episode_length(agent: Agent, env_id: str) -> int | None:
+    """
+    :param agent: A trained agent
+    :param env_id: Id of its environment
+    :return: Steps of its longest episodes, which all of an allocator's are; None if that is not known
+    """
+    given = saved_env_kwargs(agent.run_folder, EnvironmentName(env_id))
+    n_tasks = {**gym.spec(env_id).kwargs, **given}.get("n_tasks")
+    return n_tasks if isinstance(n_tasks, int) else None
 
 
 def environment_of(agent: Agent) -> Callable[..., VecEnv]:

@@ -10,6 +10,7 @@ from sb3_uav.common.files import write_atomically
 
 _NOTE = "downloaded_from_hub.json"
 # The variable of huggingface_sb3: https://github.com/huggingface/huggingface_sb3/blob/v3.0/huggingface_sb3/load_from_hub.py
+TRUST_FLAG = ("--trust", "unpickle an agent that load-from-hub downloaded")
 _VARIABLE = "TRUST_REMOTE_CODE"
 
 
