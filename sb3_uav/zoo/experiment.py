@@ -24,7 +24,7 @@ from sb3_uav.zoo.checkpoints import PairCheckpointCallback
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
-from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
+from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
 # Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
 _SETUP_ERRORS = (
@@ -144,9 +144,23 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
         if not self._eval_env_kwargs_given:
             self.eval_env_kwargs = self.env_kwargs
+        self._choose_info_keywords()
         if not self.eval_freq_given:
             self._choose_eval_freq(hyperparams, processed[2])
         return processed
+
+    def _choose_info_keywords(self) -> None:
+        """
+        Log in the monitor files what rl_zoo3 logs of robots: whether an episode was a success.
+
+        https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L697
+        """
+        given = self.monitor_kwargs.get("info_keywords")
+        if given is not None:
+            # Monitor joins it to a tuple.
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(given)}
+        elif has_success(self.env_name.gym_id) and not any("reward" in kw for kw in (self.env_kwargs, self.eval_env_kwargs)):
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": ("is_success",)}
 
     def _choose_eval_freq(self, hyperparams: dict[str, Any], callbacks: list[BaseCallback]) -> None:
         """

@@ -31,15 +31,14 @@ def record_video(arguments: Sequence[str]) -> None:
     """
     require_zoo("Recording a video", "rl_zoo3.enjoy")
     from sb3_uav.zoo.experiment import register_algorithms
-    from sb3_uav.zoo.replay import agent_parser, environment_of, episode_length, find_agent, without_flag
+    from sb3_uav.zoo.replay import agent_parser, environment_of, episode_length, find_agent, without_flag, without_packages
     from sb3_uav.zoo.rl_zoo3_compat import command_line, help_text, run_script
     from sb3_uav.zoo.trust import TRUST_FLAG
 
     register_algorithms()
-    arguments, trust = without_flag(arguments, "--trust")
-    parser = agent_parser()
-    parser.add_argument("-n", "--n-timesteps", type=int)
-    chosen, _ = parser.parse_known_args(arguments)
+    chosen, _ = agent_parser().parse_known_args(arguments)
+    # What rl_zoo3's command does not know.
+    arguments, trust = without_flag(without_packages(arguments), "--trust")
     if chosen.help:
         with command_line(_PROG, ["--help"]), help_text(None, _HELP, TRUST_FLAG):
             run_script("rl_zoo3.record_video", environment_of)

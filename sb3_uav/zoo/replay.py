@@ -40,18 +40,22 @@ class Agent(NamedTuple):
     run_folder: Path
 
 
-def agent_parser() -> argparse.ArgumentParser:
-    """:return: A parser of the arguments by which rl_zoo3's commands choose an agent, with our defaults"""
+def agent_parser(with_help: bool = True) -> argparse.ArgumentParser:
+    """
+    :param with_help: Whether to take ``--help``, as a flag like the others
+    :return: A parser of the arguments by which rl_zoo3's commands choose an agent, with our defaults
+    """
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo", default="reinforce")
-    parser.add_argument("--env", default="CartPole-v1")
-    parser.add_argument("-f", "--folder", default="logs")
-    parser.add_argument("--exp-id", default=0, type=int)
-    parser.add_argument("--load-best", action="store_true")
-    parser.add_argument("--load-checkpoint", type=int)
-    parser.add_argument("--load-last-checkpoint", action="store_true")
-    parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("--algo", default="reinforce", help="algorithm (default: %(default)s)")
+    parser.add_argument("--env", default="CartPole-v1", help="environment ID")
+    parser.add_argument("-f", "--folder", default="logs", help="log folder (default: %(default)s)")
+    parser.add_argument("--exp-id", default=0, type=int, help="number of the run (default: 0, the last one)")
+    parser.add_argument("--load-best", action="store_true", help="the best model of the run, not the last one")
+    parser.add_argument("--load-checkpoint", type=int, metavar="STEPS", help="the checkpoint after so many steps")
+    parser.add_argument("--load-last-checkpoint", action="store_true", help="the last checkpoint")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
+    if with_help:
+        parser.add_argument("-h", "--help", action="store_true")
     return parser
 
 
@@ -135,3 +139,13 @@ def without_flag(arguments: Sequence[str], flag: str) -> tuple[list[str], bool]:
     :return: The other arguments, and whether the flag was among them
     """
     return [argument for argument in arguments if argument != flag], flag in arguments
+
+
+def without_packages(arguments: Sequence[str]) -> list[str]:
+    """
+    :param arguments: Command line arguments
+    :return: Those besides ``--gym-packages``
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+")
+    return parser.parse_known_args(arguments)[1]

@@ -44,8 +44,10 @@ def train(arguments: Sequence[str]) -> None:
     parser.add_argument("-P", "--progress", action="store_true")
     parser.add_argument("--track", action="store_true")
     parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--trust", action="store_true")
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
+    arguments = [argument for argument in arguments if argument != "--trust"]
     require_zoo("Training from YAML")
     if known.progress:
         require_zoo("The progress bar", "tqdm.rich", "rich")
@@ -56,10 +58,11 @@ def train(arguments: Sequence[str]) -> None:
     from sb3_uav.zoo.configs import default_config
     from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
     from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, help_text, rl_zoo3
+    from sb3_uav.zoo.trust import TRUST_FLAG, require_trust
 
     register_algorithms()
     if known.help:
-        with command_line(_PROG, ["--help"]), help_text(rl_zoo3.train, _HELP):
+        with command_line(_PROG, ["--help"]), help_text(rl_zoo3.train, _HELP, TRUST_FLAG):
             rl_zoo3.train.train()
     for module in known.gym_packages:
         import_module(module)
@@ -67,6 +70,8 @@ def train(arguments: Sequence[str]) -> None:
         ensure_registered(known.env)
     if known.trained_agent is not None and not Path(known.trained_agent).is_file():
         raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
+    if known.trained_agent is not None:
+        require_trust(Path(known.trained_agent).parent, known.trust)
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
