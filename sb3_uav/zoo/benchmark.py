@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
@@ -47,6 +49,10 @@ def benchmark(arguments: Sequence[str]) -> None:
     if {"-h", "--help"} & set(arguments):
         with command_line(_PROG, ["--help"]), help_text(None, _HELP, TRUST_FLAG):
             run_script("rl_zoo3.benchmark")
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--benchmark-dir", type=Path, default=Path("logs/benchmark"))
+    # rl_zoo3 writes there even if no replay has made it.
+    parser.parse_known_args(arguments)[0].benchmark_dir.mkdir(parents=True, exist_ok=True)
     with command_line(_PROG, ["--log-dir", "logs", "--no-hub", *arguments]):
         run_script("rl_zoo3.benchmark", run_command=replay)
     if codes and any(codes):

@@ -31,6 +31,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     from sb3_uav.zoo.experiment import make_batched_vec_env, register_algorithms
     from sb3_uav.zoo.replay import agent_parser, environment_of, find_agent, without_flag
     from sb3_uav.zoo.rl_zoo3_compat import command_line, default_vec_env, help_text, replay_environment
+    from sb3_uav.zoo.trust import TRUST_FLAG
 
     register_algorithms()
     import rl_zoo3.enjoy
@@ -38,10 +39,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     arguments, trust = without_flag(arguments, "--trust")
     chosen, _ = agent_parser().parse_known_args(arguments)
     if chosen.help:
-        with (
-            command_line(_PROG, ["--help"]),
-            help_text(rl_zoo3.enjoy, _HELP, "--trust", "replay an agent that load-from-hub downloaded"),
-        ):
+        with command_line(_PROG, ["--help"]), help_text(rl_zoo3.enjoy, _HELP, TRUST_FLAG):
             rl_zoo3.enjoy.enjoy()
     make_env = environment_of(find_agent(chosen, trust))
     flags = ["--algo", chosen.algo, "-f", chosen.folder, *arguments]

@@ -86,6 +86,11 @@ def train(arguments: Sequence[str]) -> None:
             raise
         except OSError as error:
             raise OSError(f"could not write: {error}. Earlier files are intact.") from error
+        except Exception as error:
+            # wandb is not imported here, so that its classes cannot be named.
+            if type(error).__module__.partition(".")[0] != "wandb":
+                raise
+            raise ValueError(f"--track: {error} Or set WANDB_MODE=offline.") from error
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.
