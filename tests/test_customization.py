@@ -38,7 +38,7 @@ def first_instance(**kwargs: Any) -> Instances:
 
 def play(env: ProblemEnv, choose: Any) -> tuple[list[float], dict[str, Any]]:
     env.reset(seed=0)
-    rewards, done, info = [], False, {}
+    rewards, done, info = [], False, dict[str, Any]()
     while not done:
         _, reward, done, _, info = env.step(choose(env))
         rewards.append(reward)
@@ -63,7 +63,7 @@ def test_generators_are_made_with_the_sizes_of_the_environment() -> None:
 def test_generators_get_further_arguments_and_may_have_a_size_of_their_own() -> None:
     env = make(generator={"zoo_hooks.Scaled": {"n_tasks": 7, "scale": 0.01}})
     env.reset(seed=0)
-    assert env.instance.n_tasks == 7 and env.instance.tasks.max() <= 0.01 and env.action_space.n == 3
+    assert env.instance.n_tasks == 7 and env.instance.tasks.max() <= 0.01 and env.action_space == gym.spaces.Discrete(3)
     clusters = make(generator={"sb3_uav.envs.ClusteredGenerator": {"n_clusters": 2}}).problem.generator
     assert (clusters.n_clusters, clusters.n_tasks, clusters.max_distance) == (2, 20, 1.5)  # type: ignore[attr-defined]
 

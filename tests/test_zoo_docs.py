@@ -21,7 +21,7 @@ from sb3_uav.cli import main as cli
 
 PAGE = (Path(__file__).parents[1] / "docs" / "zoo.md").read_text(encoding="utf-8")
 NEEDED = {"record-video": ["moviepy"]}
-NEEDED |= dict.fromkeys(("all-plots", "plot-from-file", "plot-train"), ["seaborn", "scipy.spatial"])
+NEEDED |= {name: ["seaborn", "scipy.spatial"] for name in ("all-plots", "plot-from-file", "plot-train")}
 
 
 def blocks(language: str) -> list[str]:
@@ -58,7 +58,7 @@ def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     monkeypatch.delenv("TRUST_REMOTE_CODE", raising=False)
     Hub.install(tmp_path / "hub", monkeypatch)
     fake = types.ModuleType("wandb")
-    fake.init = lambda **_: types.SimpleNamespace(config={})  # type: ignore[attr-defined]
+    fake.init = lambda **_: types.SimpleNamespace(config=types.SimpleNamespace(setdefaults=print))  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "wandb", fake)
     (code,), (settings,) = blocks("python"), blocks("yaml")
     Path("my_fleet.py").write_text(code)
@@ -85,4 +85,4 @@ def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert (tmp_path / "repository" / "README.md").is_file() and (tmp_path / "hub" / "me" / f"reinforce-{ENV}").is_dir()
     for name, command in (("curves.png", "all-plots"), ("boxes.png", "plot-from-file"), ("train.png", "plot-train")):
         assert (tmp_path / name).is_file() == can_run(command)
-    assert bool(list(run.rglob("*.mp4"))) == can_run("record-video")
+    assert bool(list((tmp_path / "logs").rglob("*.mp4"))) == can_run("record-video")

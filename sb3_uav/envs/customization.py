@@ -105,7 +105,7 @@ def _imported(argument: str, given: Any) -> tuple[Any, dict[str, Any]]:
     :return: The object, and the arguments
     :raises ValueError: If the path cannot be imported, or the mapping is another one
     """
-    path, arguments = given, {}
+    path, arguments = given, dict[str, Any]()
     if isinstance(given, dict):
         if len(given) != 1 or not all(isinstance(value, dict | None) for value in given.values()):
             raise _refusal(argument, given, "write one dotted path and a mapping of its arguments, {path: {key: value}}.")

@@ -183,9 +183,9 @@ def _evaluate(agent: Agent, args: argparse.Namespace, env_kwargs: dict[str, Any]
         if local["done"] and "is_success" in local["info"]:
             successes.append(local["info"]["is_success"])
 
-    returns, _ = evaluate_policy(
+    returns: Any = evaluate_policy(
         model, env, args.n_eval_episodes, not args.stochastic, callback=note_success, return_episode_rewards=True
-    )
+    )[0]
     env.close()
     rate = float(np.mean(successes)) if successes else None
     results = Results(float(np.mean(returns)), float(np.std(returns)), rate, len(returns), not args.stochastic, args.seed)

@@ -41,7 +41,7 @@ def record_video(arguments: Sequence[str]) -> None:
     arguments, trust = without_flag(without_packages(arguments), "--trust")
     if chosen.help:
         with command_line(_PROG, ["--help"]), help_text(None, _HELP, TRUST_FLAG):
-            run_script("rl_zoo3.record_video", environment_of)
+            run_script("rl_zoo3.record_video")
     require("moviepy", "Recording a video", "video")
     require("matplotlib", "Recording a video", "plots")
     agent = find_agent(chosen, trust)

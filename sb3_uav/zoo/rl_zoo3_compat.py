@@ -84,7 +84,8 @@ def help_text(module: ModuleType | None, description: str, *more: tuple[str, str
             super().__init__(**kwargs, usage="%(prog)s [options]")
             for flag, text in more:
                 name, _, metavar = flag.partition(" ")
-                self.add_argument(name, help=text, **({"metavar": metavar} if metavar else {"action": "store_true"}))
+                kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
+                self.add_argument(name, help=text, **kind)
 
     # Not in argparse itself, whose class names itself.
     stand_in = ModuleType("argparse")
