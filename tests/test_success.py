@@ -98,16 +98,16 @@ def test_batched_rows_say_the_same_as_single_environments() -> None:
 
 @pytest.mark.parametrize(("policy", "env_class"), [("AllocatorPolicy", TaskAllocationEnv), ("RouterPolicy", RoutePlanningEnv)])
 def test_the_fused_driver_counts_successes(policy: str, env_class: Any) -> None:
-    """With enough distance all episodes succeed, with none to speak of none; in evaluation too."""
+    """With enough distance all episodes succeed, with little only some; in SB3's evaluation too."""
     rates = []
-    for distance in (100.0, 0.75):
+    for distance in (100.0, 1.2):
         env = BatchedVecEnv([lambda distance=distance: env_class(6, max_distance=distance)] * 4)  # type: ignore[misc]
         model = REINFORCE(policy, env, n_samples=2, policy_kwargs=NETWORK, seed=0, device="cpu")
-        evaluation = EvalCallback(env_class(6, max_distance=distance), n_eval_episodes=3, eval_freq=1, verbose=0)
+        evaluation = EvalCallback(env_class(6, max_distance=distance), n_eval_episodes=10, eval_freq=6, verbose=0)
         model.learn(1, callback=evaluation)
         assert model.ep_success_buffer is not None and len(model.ep_success_buffer) == 8
         rates.append((float(np.mean(model.ep_success_buffer)), float(np.mean(evaluation._is_success_buffer))))
-    assert rates[0] == (1.0, 1.0) and max(rates[1]) < 0.9
+    assert rates[0] == (1.0, 1.0) and 0 < min(rates[1]) <= max(rates[1]) < 1
 
 
 def test_samples_are_judged_one_by_one() -> None:
