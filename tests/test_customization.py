@@ -68,6 +68,16 @@ def test_generators_get_further_arguments_and_may_have_a_size_of_their_own() -> 
     assert (clusters.n_clusters, clusters.n_tasks, clusters.max_distance) == (2, 20, 1.5)  # type: ignore[attr-defined]
 
 
+def test_generators_may_draw_fewer_tasks_than_they_have_slots_for() -> None:
+    class Fewer(UniformGenerator):
+        def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+            return UniformGenerator(self.n_tasks - 3, self.n_uavs)(batch_size, rng)
+
+    env = make(generator=Fewer(20, 3))
+    env.reset(seed=0)
+    assert env.instance.task_mask.sum().item() == 17 and env.instance.n_tasks == 20
+
+
 def test_distributions_draw_points_and_values() -> None:
     plain = first_instance(distribution="zoo_hooks.stripe")
     assert plain.tasks[..., 0].max() <= 0.1 < plain.tasks[..., 1].max() and (plain.values == 1).all()

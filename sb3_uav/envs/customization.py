@@ -216,7 +216,8 @@ def _drawn(argument: str, given: Any, source: InstanceGenerator) -> Instances:
         if not isinstance(drawn, Instances):
             raise ValueError(f"it returned an object of type {type(drawn).__name__}; return sb3_uav.envs.Instances.")
         found, expected = (len(drawn), drawn.n_tasks, drawn.n_uavs), (_N_TRIED, source.n_tasks, source.n_uavs)
-        if found != expected:
+        # Fewer tasks are padded.
+        if found != expected and (found[::2] != expected[::2] or drawn.n_tasks > source.n_tasks):
             text = "{} instances of {} tasks and {} UAVs"
             raise ValueError(f"it drew {text.format(*found)} instead of {text.format(*expected)}.")
         drawn.validate()

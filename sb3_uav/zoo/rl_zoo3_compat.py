@@ -83,7 +83,7 @@ def help_text(module: ModuleType | None, description: str, *more: tuple[str, str
             kwargs |= {"description": description, "formatter_class": argparse.RawDescriptionHelpFormatter}
             super().__init__(**kwargs, usage="%(prog)s [options]")
             for flag, text in more:
-                name, _, metavar = flag.partition(" ")
+                name, metavar = [*flag.split(" "), ""][:2]
                 kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
                 self.add_argument(name, help=text, **kind)
 
