@@ -30,7 +30,7 @@ from sb3_uav.cli.compare import _make_parser
 from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.studies.compare.common_ground import make_validation_set
 from sb3_uav.studies.compare.fixed_router import _DividedSubsets, pretrain_router
-from sb3_uav.studies.compare.report import Run, _compute_band, _compute_table, _csv_text, _estimate, _interpolate
+from sb3_uav.studies.compare.report import Run, _compute_band, _compute_table, _csv_text, _difference, _estimate, _interpolate
 from sb3_uav.studies.compare.runs import ZooTraining, train_all
 from sb3_uav.studies.compare.settings import Settings
 from sb3_uav.studies.compare.study import _with_common_ground
@@ -70,9 +70,8 @@ def test_table_at_equal_steps(runs):
     # t(0.975, 1) = 12.706; the standard error of (8, 11) is 1.5, that of (6, 8) is 1.
     assert best.greedy.half_width == pytest.approx(12.706 * 1.5) and other.greedy.half_width == pytest.approx(12.706)
     assert best.sampled is not None and best.sampled.mean == 10.5
-    # Instances: A has 5 and 9, B has 8 and 11.
-    assert other.difference.mean == pytest.approx(-2.5) and other.difference.half_width == pytest.approx(12.706 * 0.5)
-    assert best.difference == (0.0, 0.0)
+    assert other.difference.mean == pytest.approx(-2.5) and other.difference.half_width > 0
+    assert best.difference == best.sampled_difference == (0.0, 0.0)
     assert other.seconds == pytest.approx((10 + 1000 / 110) / 2) and other.cpu_seconds == pytest.approx(other.seconds / 2)
 
 
@@ -88,6 +87,18 @@ def test_one_seed_has_no_interval(runs):
     row = _compute_table(runs[:1], "timesteps", 100)[0]
     assert np.isnan(row.greedy.half_width) and str(row.greedy) == "6.00"
     assert str(_estimate(np.array([1.0, 3.0, 2.0]))) == "2.00 ± 2.48"
+
+
+@pytest.mark.parametrize(("shared", "expected"), [(True, 1.96 * (2 / 40) ** 0.5), (False, 1.96 * (2 / 40 + 8 / 200) ** 0.5)])
+def test_interval_of_a_difference(shared, expected):
+    """Seeds have variance 1, instances 4. What two variants have in common in an instance cancels out, the rest does not."""
+    rng = np.random.default_rng(3)
+    instances = rng.normal(0, 2, (2, 1, 200))
+    first, second = rng.normal(0, 1, (2, 40, 1)) + (instances[:1] if shared else instances)
+    found = _difference(first, second)
+    assert found.mean == pytest.approx(first.mean() - second.mean())
+    assert found.half_width == pytest.approx(expected, rel=0.25)
+    assert np.isnan(_difference(first[:1], second).half_width)
 
 
 def test_student_intervals_agree_with_tables():
@@ -152,11 +163,11 @@ def test_default_variants_come_from_the_shipped_yamls(env_id):
         assert shared[key] * shared["n_samples"] == rollout[key] * rollout["n_samples"]
 
 
-def test_paper_entries_get_a_shared_baseline_too():
+def test_both_baselines_have_equally_many_episodes():
     variants = {variant.name: variant.entry for variant in read_variants(None, "TaskAllocation-U4-N80-v0")}
     shared, rollout = variants["REINFORCE, shared baseline"], variants["REINFORCE, rollout baseline"]
-    assert (shared["n_samples"], shared["n_envs"], shared["instances_per_epoch"]) == (8, 64, 160_000)
-    assert (rollout["n_samples"], rollout["n_envs"], rollout["instances_per_epoch"]) == (1, 512, 1_280_000)
+    assert (shared["n_samples"], shared["n_envs"], shared["instances_per_epoch"]) == (8, 32, 512)
+    assert (rollout["n_samples"], rollout["n_envs"], rollout["instances_per_epoch"]) == (1, 256, 4096)
 
 
 def test_variants_of_a_file(tmp_path):

@@ -3,6 +3,7 @@
 import itertools
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from its_runs import N_TASKS, PAPER, SMALL, equal, learn, make_allocator, make_env, make_its, snapshot, trace
@@ -11,11 +12,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 
-from sb3_uav.envs import (
-    plan_tours,
-)
-from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.envs import UniformGenerator, plan_tours
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.training import Freezer, ITSCallback
+from sb3_uav.training.imitation import imitate
 from sb3_uav.training.router_trainer import RouterTrainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
@@ -55,8 +55,47 @@ def test_ablations_are_one_switch(strategy, expected):
 def test_stops_early_when_the_steps_are_over():
     """n_timesteps binds too: the epoch that it completes is closed, the rest does not happen."""
     its = make_its()
-    make_allocator().learn(8 * N_TASKS * 2, callback=its)
-    assert trace(its) == "pp" + "aaii"
+    with pytest.warns(UserWarning, match=r"This run has 80 of the 240 steps that 6 epochs take: .* cut to 0\.33 of"):
+        make_allocator().learn(8 * N_TASKS * 2, callback=its)
+    # A third of two epochs of pre-training.
+    assert trace(its) == "p" + "aaii"
+    assert [record.n_instances for record in its.records] == [8, 8, 8, 8, 8]
+
+
+def test_steps_bound_warm_start_and_pretraining():
+    """A run of a hundredth of the plan pre-trains for a hundredth of it."""
+    its = make_its(n_epochs=100, n_pretraining_epochs=50, instances_per_epoch=80, warm_start={f"{__name__}.note_share": {}})
+    with pytest.warns(UserWarning, match="cut to 0\\.01 of their length"):
+        make_allocator(instances_per_epoch=80).learn(80 * N_TASKS, callback=its)
+    assert SHARES == [pytest.approx(0.01)]
+    assert trace(its) == "pa" and its.records[0].n_instances == 40
+
+
+def test_router_epochs_after_a_cut_pretraining_are_whole():
+    its = make_its(n_epochs=4, n_pretraining_epochs=1, n_intensive_epochs=0, instances_per_epoch=80)
+    with pytest.warns(UserWarning, match=r"cut to 0\.5 of"):
+        make_allocator(instances_per_epoch=80).learn(160 * N_TASKS, callback=its)
+    assert trace(its) == "p" + "at" * 2
+    assert [record.n_instances for record in its.records if record.level == "router"] == [40, 80, 80]
+
+
+def test_share_of_the_imitation(monkeypatch):
+    """The share cuts both the tours and the updates."""
+    pytest.importorskip("numba")
+    lines: list[str] = []
+    router = RouterPolicy(*RouterPolicy.placeholder_spaces(2), lambda _: 0.0, **SMALL)
+    allocator = AllocatorPolicy(*AllocatorPolicy.placeholder_spaces(2), lambda _: 0.0, **SMALL)
+    generator = UniformGenerator(n_tasks=6, n_uavs=2)
+    imitate(router, allocator, generator, np.random.default_rng(0), 400, 300, batch_size=4, report=lines.append, share=0.01)
+    assert lines[-1].startswith("imitation: 3 of 3 updates") and " of 4 tours" in lines[0]
+
+
+SHARES: list[float] = []
+
+
+def note_share(router, allocator, generator, rng, share):
+    """A warm start of a user."""
+    SHARES.append(share)
 
 
 class Watch(BaseCallback):

@@ -125,10 +125,10 @@ def test_resumed_in_pretraining_equals_an_unbroken_run(tmp_path, monkeypatch):
     learn(unbroken, its)
     original = RouterTrainer.learn
 
-    def interrupted(self, number, *args):
-        if number == 3:
+    def interrupted(self, size, planned, *args):
+        if planned == 3 * size:
             raise KeyboardInterrupt
-        return original(self, number, *args)
+        return original(self, size, planned, *args)
 
     with monkeypatch.context() as patch:
         patch.setattr(RouterTrainer, "learn", interrupted)

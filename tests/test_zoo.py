@@ -16,10 +16,11 @@ from stable_baselines3.common.results_plotter import load_results
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.sb3_compat import linear_schedule
 from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv
-from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import PAPER_FLEETS, PAPER_SIZES, allocation_id
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.algorithms import resolve_algorithm
 from sb3_uav.training import ITSCallback
 from sb3_uav.training.its_checkpoint import read_state
 
@@ -273,17 +274,28 @@ def test_linear_schedule():
 # ------------------------------------------------------------------------------------------ the shipped YAML
 
 
-def shipped() -> dict[str, Any]:
-    path = default_config("reinforce")
+ITS_KEY, EVALUATION_KEY = "sb3_uav.training.ITSCallback", "sb3_uav.training.FixedSetEvalCallback"
+SHIPPED = ("reinforce", "ppo", "ppo_mask", "a2c")
+
+
+def shipped(name: str) -> dict[str, Any]:
+    path = default_config(name)
     assert path is not None and default_config("dqn") is None
     return yaml.safe_load(path.read_text())
+
+
+def its_of(entry: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of an entry's ITSCallback."""
+    found = [callback[ITS_KEY] for callback in entry["callback"] if isinstance(callback, dict) and ITS_KEY in callback]
+    assert len(found) == 1
+    return found[0]
 
 
 @pytest.mark.parametrize("n_uavs", PAPER_FLEETS)
 @pytest.mark.parametrize("n_tasks", PAPER_SIZES)
 def test_shipped_settings_are_the_papers(n_uavs, n_tasks):
     """Section V-A of the paper."""
-    settings = shipped()[allocation_id(n_uavs, n_tasks)]
+    settings = shipped("paper")[allocation_id(n_uavs, n_tasks)]
     batch = 512 if n_tasks < 300 else 256
     assert settings["n_envs"] == batch and settings["policy_kwargs"] == {"preset": "paper"}
     assert settings["n_timesteps"] == 100 * 1_280_000 * n_tasks
@@ -300,16 +312,35 @@ def test_shipped_settings_are_the_papers(n_uavs, n_tasks):
     assert router["policy_kwargs"] == {"preset": "paper"}
 
 
-def test_shipped_routers_build():
+@pytest.mark.parametrize("algo", SHIPPED)
+@pytest.mark.parametrize("n_uavs", PAPER_FLEETS)
+@pytest.mark.parametrize("n_tasks", PAPER_SIZES)
+def test_entries_for_two_cores(algo, n_uavs, n_tasks):
+    """The recipe: imitation first, then the paper's phases, on rollouts of whole episodes; n_timesteps is the whole plan."""
+    entry = shipped(algo)[allocation_id(n_uavs, n_tasks)]
+    its = its_of(entry)
+    size = entry.get("instances_per_epoch") or its["instances_per_epoch"]
+    assert entry["n_timesteps"] == its["n_epochs"] * size * entry.get("n_samples", 1) * n_tasks
+    assert (its["n_intensive_epochs"], its["n_continuous_epochs"]) == {4: (8, 4), 6: (12, 6)}[n_uavs]
+    assert its["warm_start"]["n_updates"] >= 1000 and its["router"]["algo"] == algo
+    assert size % entry["n_envs"] == 0 and size >= 8 * entry["n_envs"]
+    if algo != "reinforce":
+        assert entry["n_steps"] == n_tasks
+    if "ppo" in algo:
+        assert entry["batch_size"] * 4 == entry["n_steps"] * entry["n_envs"]
+    assert "paper" not in str(entry) and any(EVALUATION_KEY in callback for callback in entry["callback"])
+
+
+@pytest.mark.parametrize("name", [*SHIPPED, "paper"])
+def test_shipped_routers_build(name):
     env = BatchedVecEnv([lambda: RoutePlanningEnv(20)] * 2)
-    callbacks = [callback for entry in shipped().values() for callback in entry.get("callback", [])]
-    strategies = [callback.get("sb3_uav.training.ITSCallback") for callback in callbacks]
-    routers = [strategy["router"] for strategy in strategies if strategy is not None]
-    assert len(routers) == 12 + 4 + 1 + 1
-    for router in routers:
+    entries = {key: entry for key, entry in shipped(name).items() if key.startswith("TaskAllocation-")}
+    assert len(entries) >= len(PAPER_FLEETS) * len(PAPER_SIZES)
+    for router in [its_of(entry)["router"] for entry in entries.values()]:
         settings = {key: value for key, value in router.items() if key not in ("algo", "n_envs", "policy")}
-        assert router["algo"] == "reinforce" and router["policy"] == "RouterPolicy"
-        REINFORCE("RouterPolicy", env, device="cpu", **settings)
+        assert router["algo"] == ("reinforce" if name == "paper" else name) and router["policy"] == "RouterPolicy"
+        algorithm: Any = resolve_algorithm(router["algo"])
+        algorithm(RouterPolicy, env, device="cpu", **settings)
 
 
 def test_texts_become_numbers():
@@ -322,7 +353,7 @@ def test_texts_become_numbers():
 def test_shipped_small_entries_build(name):
     import gymnasium as gym
 
-    settings = dict(shipped()[name])
+    settings = dict(shipped("reinforce")[name])
     for key in ("callback", "n_timesteps", "policy"):
         settings.pop(key, None)
     env = BatchedVecEnv([lambda: gym.make(name)] * settings.pop("n_envs"))

@@ -17,9 +17,10 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
 }
 
 
-def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
+def resolve_algorithm(name: str, what: str = "router: algo") -> type[OnPolicyAlgorithm]:
     """
     :param name: ``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or a dotted path
+    :param what: Where it was given, as errors name it
     :return: The class of the algorithm
     :raises ValueError: If there is no such on-policy algorithm
     """
@@ -29,7 +30,7 @@ def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
         algorithm = import_object(name)
     except ValueError as error:
         choices = ", ".join(ALGORITHMS)
-        raise ValueError(f"router: algo is {name!r}; choose one of {choices} or give a dotted path.") from error
+        raise ValueError(f"{what} is {name!r}; choose one of {choices} or give a dotted path.") from error
     if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
-        raise ValueError(f"router: algo {name!r} is not an on-policy algorithm of SB3.")
+        raise ValueError(f"{what} {name!r} is not an on-policy algorithm of SB3.")
     return algorithm

@@ -15,7 +15,6 @@ from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -33,6 +32,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
+from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
@@ -49,7 +49,7 @@ NO_STEP_LIMIT = 2**62
 _NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
-class REINFORCE(OnPolicyAlgorithm):
+class REINFORCE(AnySizeAlgorithm):
     """
     REINFORCE with a choice of baselines.
 

@@ -93,9 +93,9 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     """
     from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
 
-    config = default_config("reinforce")
+    config = default_config("paper")
     if config is None:
-        raise FileNotFoundError("reinforce.yml: not found; install sb3-uav again.")
+        raise FileNotFoundError("paper.yml: not found; install sb3-uav again.")
     shipped = read_yaml(config)[allocation_id(scenario.n_uavs, scenario.n_tasks)]
     entry: dict[str, Any] = plain_numbers(deepcopy(shipped)) | dict(recipe.allocator)
     its = entry["callback"][0][_ITS_KEY]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 ITS, NO_PRETRAINING, NO_INTENSIVE, ALTERNATE_ONLY, INDEPENDENT = _STRATEGIES = (
@@ -84,6 +85,19 @@ class EpochSchedule:
         """Epochs of the router in all: before the allocator's first epoch, and after each of them."""
         later = sum(self.router_epochs_after(epoch) for epoch in range(1, self.n_epochs + 1))
         return self.n_pretraining_epochs + later
+
+    def pretraining_of(self, share: float, epoch_size: int) -> tuple[int, int]:
+        """
+        Pre-training of a run that takes only a part of the planned steps.
+
+        :param share: That part, above 0 and at most 1
+        :param epoch_size: Instances of a router epoch
+        :return: Number of epochs, instances of each
+        """
+        n_epochs = math.ceil(share * self.n_pretraining_epochs)
+        if share == 1 or n_epochs == 0:
+            return n_epochs, epoch_size
+        return n_epochs, math.ceil(share * self.n_pretraining_epochs * epoch_size / n_epochs)
 
     def phase(self, epoch: int) -> str:
         """

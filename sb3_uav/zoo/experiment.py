@@ -18,11 +18,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
 from sb3_uav.zoo.checkpoints import PairCheckpointCallback
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
+from sb3_uav.zoo.fine_tuning import Weights, find_checkpoint, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
@@ -71,6 +72,7 @@ class UAVExperimentManager(ExperimentManager):
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
+        self._weights: Weights | None = None
         self._eval_env_kwargs_given = getattr(args, "eval_env_kwargs", None) is not None
         if kwargs.get("vec_env_type", "dummy") == "dummy":
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
@@ -136,6 +138,14 @@ class UAVExperimentManager(ExperimentManager):
 
     # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L443
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        if self.continue_training:
+            env = gym.spec(self.env_name.gym_id).make(**(hyperparams.get("env_kwargs") or self.env_kwargs or {}))
+            env_spaces = (env.observation_space, env.action_space)
+            env.close()
+            callbacks, algorithm = hyperparams.get("callback"), rl_zoo3.ALGOS[self.algo]
+            self._weights = weights_to_start_from(Path(self.trained_agent), algorithm, *env_spaces, callbacks)
+            if self._weights is not None:
+                hyperparams = start_from(self._weights, hyperparams)
         try:
             processed = super()._preprocess_hyperparams(hyperparams)
         except TypeError as error:
@@ -193,8 +203,19 @@ class UAVExperimentManager(ExperimentManager):
         for callback in self.callbacks:
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
-                if self.continue_training and callback.resume_from is None:
-                    callback.resume_from = _find_checkpoint(Path(self.trained_agent))
+                if self.continue_training and self._weights is None and callback.resume_from is None:
+                    callback.resume_from = find_checkpoint(Path(self.trained_agent))
+
+    # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L679
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self._weights is None:
+            return super()._load_pretrained_agent(hyperparams, env)
+        rewards = "" if self._weights.router is None else f" and the router {self._weights.router}"
+        print(f"Starting a new run with the weights of {self._weights.zip_file}{rewards}")
+        settings = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        settings |= dict(seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device)
+        algorithm: Any = rl_zoo3.ALGOS[self.algo]
+        return load(self._weights.zip_file, env, algorithm, **settings)
 
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
@@ -240,17 +261,3 @@ def _is_fixed_set_evaluation(entry: Any) -> bool:
     """
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
-
-
-def _find_checkpoint(trained_agent: Path) -> Path:
-    """
-    :param trained_agent: The allocator's zip to resume from
-    :return: The folder with the state of its interactive training
-    :raises FileNotFoundError: If there is none; the message names the zip to use if there is one near
-    """
-    beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
-    if (beside / STATE_FILE).is_file():
-        return beside
-    if (below / STATE_FILE).is_file():
-        return below
-    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which names its router.")

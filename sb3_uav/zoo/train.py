@@ -11,6 +11,7 @@ from pathlib import Path
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
 from sb3_uav.common.optional import require
+from sb3_uav.pretrained import names
 from sb3_uav.registration import ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
 
@@ -57,6 +58,7 @@ def train(arguments: Sequence[str]) -> None:
         require("wandb", "--track", "track")
     from sb3_uav.zoo.configs import default_config
     from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
+    from sb3_uav.zoo.fine_tuning import zip_of_pair
     from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, help_text, rl_zoo3
     from sb3_uav.zoo.trust import TRUST_FLAG, require_trust
 
@@ -68,15 +70,20 @@ def train(arguments: Sequence[str]) -> None:
         import_module(module)
     if known.env is not None:
         ensure_registered(known.env)
-    if known.trained_agent is not None and not Path(known.trained_agent).is_file():
-        raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
-    if known.trained_agent is not None:
+    shipped = None if known.trained_agent is None else zip_of_pair(known.trained_agent, known.env)
+    if known.trained_agent is not None and shipped is None and not Path(known.trained_agent).is_file():
+        raise FileNotFoundError(
+            f"-i {known.trained_agent}: no such file; give the zip of a trained agent, or one of {names()}."
+        )
+    if known.trained_agent is not None and shipped is None:
         require_trust(Path(known.trained_agent).parent, known.trust)
+    # The last one counts.
+    agent = [] if shipped is None else ["-i", str(shipped)]
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
-    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments]):
+    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments, *agent]):
         try:
             rl_zoo3.train.train()
         except AssertionError as error:

@@ -32,6 +32,7 @@ FIGURE_FILES = ("comparison.png", "comparison.pdf")
 _CSV_COLUMNS = ("algorithm", "variant", "seed", "timesteps", "wall_seconds", "cpu_seconds", "greedy", "sampled")
 _PACKAGES = ("stable-baselines3", "sb3-contrib", "rl-zoo3", "gymnasium", "torch", "numpy")
 _GRID_POINTS = 200
+_BOOTSTRAP_SAMPLES = 2_000
 
 
 class Run(NamedTuple):
@@ -74,8 +75,8 @@ class _TableRow(NamedTuple):
     :param cpu_seconds: Mean of the CPU seconds, which other processes on the machine disturb less
     :param greedy: Mean objective of greedy decoding; the interval is over seeds
     :param sampled: The same of the best of the samples; None without sampling
-    :param difference: Greedy objective minus that of the best variant, paired instance by instance; the interval is over
-        instances
+    :param difference: Greedy objective minus that of the variant that is best by it, see :func:`_difference`
+    :param sampled_difference: The same of the best of the samples; None without sampling
     """
 
     variant: str
@@ -86,6 +87,7 @@ class _TableRow(NamedTuple):
     greedy: _Estimate
     sampled: _Estimate | None
     difference: _Estimate
+    sampled_difference: _Estimate | None
 
 
 def _by_variant(runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -102,6 +104,31 @@ def _estimate(values: np.ndarray) -> _Estimate:
     :return: Their mean and its confidence interval
     """
     return _Estimate(float(values.mean()), float(confidence_halfwidth(values)))
+
+
+def _difference(values: np.ndarray, others: np.ndarray) -> _Estimate:
+    """
+    The mean difference of two variants, paired by instance. Its 95 % interval is that of a bootstrap over seeds and instances,
+    so that it holds for other seeds and other instances.
+
+    :param values: ``(n_seeds, n_instances)``
+    :param others: ``(n_other_seeds, n_instances)``, on the same instances
+    :return: The mean, and half of the width of the interval; NaN where one variant has a single seed
+    """
+    mean = float(values.mean() - others.mean())
+    if min(len(values), len(others)) < 2:
+        return _Estimate(mean, math.nan)
+    if values is others:
+        return _Estimate(0.0, 0.0)
+    rng = np.random.default_rng(0)
+    means = []
+    for _ in range(_BOOTSTRAP_SAMPLES):
+        columns = rng.integers(values.shape[1], size=values.shape[1])
+        rows, other_rows = (rng.integers(len(array), size=len(array)) for array in (values, others))
+        # The mean over seeds first: it is much smaller than the table of all.
+        means.append(values[rows].mean(0)[columns].mean() - others[other_rows].mean(0)[columns].mean())
+    low, high = np.quantile(means, [0.025, 0.975])
+    return _Estimate(mean, float(high - low) / 2)
 
 
 def _interpolate(x: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -138,10 +165,12 @@ def _compute_table(runs: Sequence[Run], axis: str, at: float) -> list[_TableRow]
     groups = _by_variant(runs)
     # (n_seeds, n_instances) each.
     greedy = {name: np.stack([of(run, "results") for run in group]) for name, group in groups.items()}
+    sampled = {name: np.stack([of(run, "sampled") for run in group]) for name, group in groups.items()}
+    has_samples = all(values.shape[1] > 0 for values in sampled.values())
     best = max(greedy, key=lambda name: greedy[name].mean())
+    best_sampled = max(sampled, key=lambda name: sampled[name].mean()) if has_samples else best
     rows = []
     for name, group in groups.items():
-        sampled = np.stack([of(run, "sampled") for run in group])
         rows.append(
             _TableRow(
                 variant=name,
@@ -150,8 +179,9 @@ def _compute_table(runs: Sequence[Run], axis: str, at: float) -> list[_TableRow]
                 seconds=float(np.mean([of(run, "train_seconds") for run in group])),
                 cpu_seconds=float(np.mean([of(run, "cpu_seconds") for run in group])),
                 greedy=_estimate(greedy[name].mean(1)),
-                sampled=_estimate(sampled.mean(1)) if sampled.shape[1] > 0 else None,
-                difference=_estimate(greedy[name].mean(0) - greedy[best].mean(0)),
+                sampled=_estimate(sampled[name].mean(1)) if has_samples else None,
+                difference=_difference(greedy[name], greedy[best]),
+                sampled_difference=_difference(sampled[name], sampled[best_sampled]) if has_samples else None,
             )
         )
     return sorted(rows, key=lambda row: -row.greedy.mean)
@@ -223,12 +253,12 @@ def _markdown_table(rows: Sequence[_TableRow], n_samples: int) -> str:
     :return: A table
     """
     columns = ["", "seeds", "steps", "seconds", "CPU seconds", "greedy"]
-    columns += [f"best of {n_samples}"] * (n_samples > 0) + ["greedy, difference to the best"]
+    columns += ["difference to the best"] + [f"best of {n_samples}", "difference to the best"] * (n_samples > 0)
     lines = [columns, ["---"] + ["---:"] * (len(columns) - 1)]
-    for number, row in enumerate(rows):
+    for row in rows:
         times = [f"{row.timesteps:,.0f}", f"{row.seconds:,.1f}", f"{row.cpu_seconds:,.1f}"]
-        cells = [row.variant, str(row.n_seeds), *times, str(row.greedy)]
-        cells += [str(row.sampled)] * (n_samples > 0) + ["" if number == 0 else str(row.difference)]
+        cells = [row.variant, str(row.n_seeds), *times, str(row.greedy), str(row.difference)]
+        cells += [str(row.sampled), str(row.sampled_difference)] * (n_samples > 0)
         lines.append(cells)
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
@@ -313,8 +343,9 @@ def write_results(
         "## How to read this",
         "",
         "Objectives: mean over the validation instances, and the 95 % confidence interval over training seeds (Student's t).",
-        "Last column: a variant's greedy objective (mean over its seeds) minus that of the best variant, paired instance by",
-        "instance, and the 95 % confidence interval over instances. Values between two evaluations are interpolated.",
+        "Differences: a variant's mean minus that of the variant that is best in the column before, paired instance by",
+        "instance, and the 95 % interval of a bootstrap over seeds and instances (none with a single seed). Values between two",
+        "evaluations are interpolated.",
         "Seconds are wall time of learning alone, without evaluations, saving and the start of the process. Greedy",
         "episodes of the rollout baseline take time but do not count as environment steps.",
         "",
