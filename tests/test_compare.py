@@ -348,7 +348,7 @@ def test_termination_ends_the_trainings_too(tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--env", "TaskAllocation-U3-N21-v0"], "there is no such environment; those of sb3_uav of this kind are"),
+        (["--env", "TaskAllocation-U3-v0"], "which no environment has; did you mean TaskAllocation-v0 or"),
         (["--env", "CartPole-v1"], "is not an environment of sb3_uav"),
         (["--seeds", "1", "1"], "give different numbers"),
         (["--jobs", "0"], "--jobs is 0; it must be at least 1"),

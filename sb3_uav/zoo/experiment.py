@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from huggingface_sb3 import EnvironmentName
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common.random_streams import EVALUATION_SEED
@@ -17,10 +20,12 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
+from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, find_checkpoint, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
-from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
+from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
 # Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
 _SETUP_ERRORS = (
@@ -79,15 +84,34 @@ class UAVExperimentManager(ExperimentManager):
         return f"{self.config}, {self.env_name.gym_id}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        entry = self.env_name.gym_id
         if str(self.config).endswith((".yml", ".yaml")):
-            read_yaml(Path(self.config))
-        hyperparams, saved = super().read_hyperparameters()
+            entry = find_entry(read_yaml(Path(self.config)), entry, self.env_kwargs) or entry
+        with self._reading(entry):
+            hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
         check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
         hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
         check_values(hyperparams, self._where)
+        scaled = scaled_values(hyperparams, entry, self.env_name.gym_id, self.env_kwargs)
+        for key, value in scaled.items():
+            if key not in (self.custom_hyperparams or {}):
+                print(f"{key} is for another number of tasks: {hyperparams[key]} becomes {value}")
+                hyperparams[key] = saved[key] = value
         return hyperparams, saved
+
+    @contextmanager
+    def _reading(self, entry: str) -> Iterator[None]:
+        """:param entry: What rl_zoo3 reads of the YAML in the ``with`` block; it looks for the entry of its environment"""
+        env_name = self.env_name
+        if entry != env_name.gym_id:
+            print(f"{self.config} has no entry for {env_name.gym_id}; using that of {entry}")
+        self.env_name = EnvironmentName(entry)
+        try:
+            yield
+        finally:
+            self.env_name = env_name
 
     def setup_experiment(self) -> Any:
         try:
@@ -130,9 +154,23 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
         if not self._eval_env_kwargs_given:
             self.eval_env_kwargs = self.env_kwargs
+        self._choose_info_keywords()
         if not self.eval_freq_given:
             self._choose_eval_freq(hyperparams, processed[2])
         return processed
+
+    def _choose_info_keywords(self) -> None:
+        """
+        Log in the monitor files what rl_zoo3 logs of robots: whether an episode was a success.
+
+        https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L697
+        """
+        given = self.monitor_kwargs.get("info_keywords")
+        if given is not None:
+            # Monitor joins it to a tuple.
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(given)}
+        elif has_success(self.env_name.gym_id) and not any("reward" in kw for kw in (self.env_kwargs, self.eval_env_kwargs)):
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": ("is_success",)}
 
     def _choose_eval_freq(self, hyperparams: dict[str, Any], callbacks: list[BaseCallback]) -> None:
         """
@@ -141,7 +179,7 @@ class UAVExperimentManager(ExperimentManager):
         :param hyperparams: Hyperparameters of the algorithm
         :param callbacks: Callbacks of the entry
         """
-        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
+        n_tasks = {**gym.spec(self.env_name.gym_id).kwargs, **self.env_kwargs}.get("n_tasks")
         if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
             # It replaces rl_zoo3's EvalCallback, with more than a few random episodes.
             self.eval_freq = -1
@@ -158,6 +196,10 @@ class UAVExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
+        self.callbacks = [
+            PairCheckpointCallback.of(callback) if type(callback) is CheckpointCallback else callback
+            for callback in self.callbacks
+        ]
         for callback in self.callbacks:
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
