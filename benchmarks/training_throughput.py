@@ -10,8 +10,10 @@ encoding, the others one, so both rates and both ratios are printed.
 ``paper``
     The settings of ``paper-U4`` and ``paper-router`` there: width 128, 3 layers, 8 heads, batch normalization, one sample and
     one greedy rollout of the baseline's policy. As in the paper, the subsets of all UAVs are padded to one size before tours
-    are planned; but what they are padded with is masked, while the paper repeats tasks, which makes tours longer, so this
-    favors the paper. Its router is the attention model: the like of ``rl4co-paper``.
+    are planned. The paper pads them to the number of tasks of the whole instance, N, by repeating tasks: decoding masks the
+    repeats, but the encoder sees them, as nodes like any other. Here they are padded to the largest subset of the batch, and
+    neither encoder nor decoder sees the padding, so that the router has fewer nodes to encode: this favors the paper. Its
+    router is the attention model: the like of ``rl4co-paper``.
 ``plain``
     The router as in ``paper``, but with layers, width, heads and normalization of ``default``: the like of ``rl4co-default``.
 ``rl4co-paper``, ``rl4co-default``
@@ -141,7 +143,7 @@ def router_shape(name: str) -> dict[str, Any]:
 def padded_plan(router: RouterPolicy) -> Router:
     """
     :param router: A router
-    :return: A planner as in the paper: all subsets at once, padded to the largest
+    :return: A planner that takes all subsets at once, padded to the largest; the paper's are padded to the whole instance
     """
     return lambda subsets: router.decode_episodes(subsets)[:, 0]
 

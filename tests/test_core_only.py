@@ -70,6 +70,18 @@ CASES: list[tuple[list[str], list[str], str]] = [
     (["matplotlib"], ["compare", *ROUTING, "--out", "out"], "plots"),
     (["optuna"], ["reproduce", "table1"], "zoo"),
     (["matplotlib"], ["reproduce", "fig5", "--redraw"], "plots"),
+    (EVERYTHING, ["record-video", *ROUTING], "zoo"),
+    (EVERYTHING, ["benchmark"], "zoo"),
+    (EVERYTHING, ["all-plots"], "zoo"),
+    (EVERYTHING, ["push-to-hub", "-orga", "me", "--env", "RoutePlanning-N20-v0"], "zoo"),
+    (EVERYTHING, ["load-from-hub", "-orga", "me", "--env", "RoutePlanning-N20-v0"], "zoo"),
+    (["moviepy"], ["record-video", *ROUTING], "video"),
+    (["moviepy"], ["push-to-hub", "-orga", "me", *ROUTING], "video"),
+    (["seaborn"], ["all-plots"], "zoo-plots"),
+    (["scipy"], ["plot-train"], "zoo-plots"),
+    (["matplotlib"], ["plot-from-file"], "zoo-plots"),
+    (["pytablewriter"], ["benchmark"], "zoo"),
+    (["wandb"], ["train", *ROUTING, "--track"], "track"),
 ]
 
 

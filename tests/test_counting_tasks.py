@@ -13,6 +13,7 @@ from conftest import instance_batches, seeds
 from hypothesis import given, settings
 from solver_helpers import MANY, make_kmeans_am, make_pair, make_policy, objectives, routes
 
+from sb3_uav import pretrained
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.solvers import DLDRL, SOLVERS, Solver, make_solver
@@ -20,6 +21,7 @@ from sb3_uav.solvers.counting_tasks import CountingTasks
 
 # Guided local search depends on the time it has, as PyVRP would without the clock of these tests.
 SPECS = ["kmeans-nearest", "kmeans-vnd", "random-nearest", "greedy-insertion", "milp", "ortools"]
+SPECS += [f"sb3:zip={pretrained.files()[0]}"]
 SPECS += ["pyvrp:time_limit=0.05"] if HAS_PYVRP else []
 NETWORKS = ("kmeans-am", "greedy", "sampling", "augment", "repair", "paper")
 

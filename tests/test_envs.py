@@ -297,7 +297,7 @@ def test_illegal_actions_are_counted() -> None:
     assert env.step(legal)[4] == {"illegal_actions": 0}
     _, reward, terminated, truncated, info = env.step(legal)
     assert (reward, terminated, truncated) == (0.0, True, False)
-    assert info == {"illegal_actions": 1, "objective": 1.0}
+    assert info == {"illegal_actions": 1, "objective": 1.0, "is_success": False}
     assert env.episodes.routes(0) == [[legal - 1]]
     env.reset(seed=0)
     assert env.step(legal)[4]["illegal_actions"] == 0

@@ -1,8 +1,6 @@
 """Every file in `examples/` runs as a user would run it, but for the size of the run, and prints what it says."""
 
 import ast
-import multiprocessing
-import os
 import re
 import runpy
 import sys
@@ -10,7 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch as th
+from forked import run_forked
+from PIL import Image
 
+from sb3_uav import pretrained
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 
@@ -18,27 +19,14 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 NUMBER = r"(\d+\.\d+)"
 
 
-# Processes of their own, forked from one that has imported what takes seconds to import.
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["sb3_contrib", "sb3_uav.training", "sb3_uav.solvers", "matplotlib.figure"])
-
-
-def play(path: Path, folder: Path, arguments: tuple[str, ...]) -> None:
-    os.chdir(folder)
+def play(path: Path, arguments: tuple[str, ...]) -> None:
     sys.argv = [str(path), *arguments]
-    th.set_num_threads(1)
-    # Closed at the end of the process, after it has written what went wrong.
-    sys.stdout, sys.stderr = (folder / "printed.txt").open("w"), (folder / "errors.txt").open("w")
     runpy.run_path(str(path), run_name="__main__")
 
 
 def run(name: str, folder: Path, *arguments: str) -> str:
     """What the example printed, started in this folder."""
-    process = FORKS.Process(target=play, args=(EXAMPLES / f"{name}.py", folder, arguments))
-    process.start()
-    process.join()
-    assert process.exitcode == 0, (folder / "errors.txt").read_text()
-    return (folder / "printed.txt").read_text()
+    return run_forked(play, folder, EXAMPLES / f"{name}.py", arguments)
 
 
 def numbers(pattern: str, text: str) -> list[float]:
@@ -104,6 +92,27 @@ def test_both_levels_evaluated_and_drawn(tmp_path):
 
 
 @pytest.mark.slow
+def test_fine_tune(tmp_path):
+    small = ("--epochs", "1", "--instances-per-epoch", "16", "--held-out", "3", "--decode", "greedy", "sampling")
+    printed = run("fine_tune", tmp_path, *small)
+    assert "router epoch 1 (alternate)" in printed
+    changed = False
+    for level, policy_class in (("allocator", AllocatorPolicy), ("router", RouterPolicy)):
+        tuned = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
+        changed |= not th.equal(*(p.encoder.embed_task.bias for p in (tuned.features_extractor, shipped(level))))
+    assert changed
+    for decode in ("greedy", "sampling"):
+        before, after, gain = numbers(
+            rf"{decode}: {NUMBER} tasks as shipped, {NUMBER} fine-tuned, gain (-?\d+\.\d+) \+- \d+\.\d+", printed
+        )
+        assert 30 < before <= 80 and abs(after - before - gain) < 0.011
+
+
+def shipped(level):
+    return load_policy(pretrained.files()[level == "router"]).features_extractor
+
+
+@pytest.mark.slow
 def test_freeze_extractor(tmp_path):
     printed = run("freeze_extractor", tmp_path, "--timesteps", "2560")
     in_encoder, n_encoder, elsewhere, n_elsewhere = numbers(
@@ -124,3 +133,16 @@ def test_own_coordinates(tmp_path):
         assert points and all((x < 1200) == (uav == 1) for x, _ in points)
         n_stops += len(points)
     assert f"{n_stops} of 15 tasks visited" in printed
+
+
+@pytest.mark.slow
+def test_watch_training(tmp_path):
+    n_maps, n_allocator, n_router = numbers(
+        r"(\d+) maps, (\d+) points of the allocator, (\d+) points of the router: watch.png",
+        run("watch_training", tmp_path, "--epochs", "2", "--instances", "64"),
+    )
+    # Two updates of 32 instances make an epoch; the router has four epochs of pre-training, and two after the second of the
+    # allocator.
+    assert (n_maps, n_allocator, n_router) == (3, 4, 12)
+    with Image.open(tmp_path / "watch.png") as picture:
+        assert picture.size[0] > 2 * picture.size[1] and len(picture.convert("RGB").getcolors(2**24) or ()) > 100

@@ -13,7 +13,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeS
 from reinforce_models import SMALL, make_env, make_model
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecMonitor, VecNormalize
 
-from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
+from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator, nearest_feasible
 from sb3_uav.envs.generators import FixedGenerator
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.drivers import _FUSED_SETTINGS, _STEP_LOOP_SETTINGS
@@ -99,7 +99,10 @@ def test_harmless_vectorized_wrappers_leave_the_fused_driver():
             r"rows 0 and 1 of the DummyVecEnv draw different instances \(FixedGenerator and FixedGenerator are not equal\)",
         ),
         (
-            [lambda: TaskAllocationEnv(6, 2), lambda: TaskAllocationEnv(6, 2, router=lambda subsets: subsets.tasks)],
+            [
+                lambda: TaskAllocationEnv(6, 2),
+                lambda: TaskAllocationEnv(6, 2, router=lambda subsets: nearest_feasible(subsets)),
+            ],
             "rows 0 and 1 of the DummyVecEnv have different routers",
         ),
     ],

@@ -141,7 +141,7 @@ def test_exactly_one_level_learns_at_any_time(network):
 
     learn_router = RouterTrainer.learn
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RouterTrainer, "learn", lambda s, n, c, others: learn_router(s, n, c, [*others, Other("router")]))
+        patch.setattr(RouterTrainer, "learn", lambda *args: learn_router(*args[:-1], [*args[-1], Other("router")]))
         learn(model, its, Other("allocator"))
     assert seen.count("allocator") == 8 and seen.count("router") == (1 + 2 + 2) * 2
 

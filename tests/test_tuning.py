@@ -24,7 +24,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER, 
 
 from sb3_uav.zoo import train
 from sb3_uav.zoo.experiment import _OUR_ALGORITHMS
-from sb3_uav.zoo.tuning import _OTHER_SPACES, _OUR_SPACES, _is_ours, register_search_spaces
+from sb3_uav.zoo.tuning import _OTHER_SPACES, _OUR_SPACES, problem_env_class, register_search_spaces
 
 ROUTING, ALLOCATION = "RoutePlanning-N20-v0", "TaskAllocation-U3-N20-v0"
 NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
@@ -69,7 +69,8 @@ class Narrower(RoutePlanningEnv):
 def test_other_environments_keep_the_spaces_of_rl_zoo3():
     if "Narrower-v0" not in gym.registry:
         gym.register("Narrower-v0", entry_point=f"{__name__}:Narrower")
-    assert _is_ours(ROUTING) and _is_ours(ALLOCATION) and _is_ours("Narrower-v0") and not _is_ours("CartPole-v1")
+    assert all(problem_env_class(env_id) for env_id in (ROUTING, ALLOCATION, "Narrower-v0"))
+    assert problem_env_class("CartPole-v1") is None
     register_search_spaces("CartPole-v1")
     assert HYPERPARAMS_SAMPLER["ppo"] is sample_ppo_params is HYPERPARAMS_SAMPLER["ppo_mask"]
     register_search_spaces(ROUTING)

@@ -1,6 +1,7 @@
 """Training from YAML through rl_zoo3: the files that it leaves, and what a user reads when something is wrong."""
 
 import csv
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -53,13 +54,14 @@ def test_log_folder_is_the_zoos(trained):
     folder = run_folder(trained)
     assert folder.name == f"{ENV}_1"
     expected = {f"{ENV}.zip", "best_model.zip", "evaluations.npz", "0.monitor.csv", ENV, "rl_model_320_steps.zip"}
-    ours = {"router.zip", "best_router.zip", "best_pair.json", "its_log.csv", "its_checkpoint"}
+    ours = {"router.zip", "best_router.zip", "best_pair.json", "its_log.csv", "its_checkpoint", "router_320_steps.zip"}
     assert expected | ours == {path.name for path in folder.iterdir()}
     assert {path.name for path in (folder / ENV).iterdir()} == {"config.yml", "args.yml", "command.txt"}
     saved = yaml.load((folder / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)  # written by rl_zoo3 just now
     assert dict(saved)["instances_per_epoch"] == 8
     evaluations = np.load(folder / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [160, 320, 480] and evaluations["results"].shape == (3, 4)
+    assert evaluations["successes"].shape == (3, 4) and evaluations["successes"].dtype == bool
     monitor = load_results(str(folder))
     assert len(monitor) == 24 and (monitor["l"] == 20).all() and (monitor["r"] <= 20).all()
     assert list((trained / "tb").rglob("events.out.tfevents.*"))
@@ -81,13 +83,33 @@ def test_saved_zips_are_ordinary_and_play_together(trained, tmp_path):
 @pytest.mark.slow
 def test_enjoy_replays_with_the_trained_router(trained, capsys):
     arguments = ["--env", ENV, "-f", str(trained / "logs"), "-n", "60", "--no-render"]
-    for flags in ([], ["--load-best"], ["--load-checkpoint", "320"]):
+    for flags, name in (
+        ([], "router.zip"),
+        (["--load-best"], "best_router.zip"),
+        (["--load-checkpoint", "320"], "router_320_steps.zip"),
+        (["--load-last-checkpoint"], "router_320_steps.zip"),
+    ):
         assert enjoy.main([*arguments, *flags]) == 0
         printed = capsys.readouterr().out
-        assert printed.count("Episode Reward:") == 3 and "3 Episodes" in printed
-        assert ("hold no router" in printed) == ("--load-checkpoint" in flags)
-        name = "best_router.zip" if flags == ["--load-best"] else "router.zip"
+        assert printed.count("Episode Reward:") == 3 and "3 Episodes" in printed and "Success rate:" in printed
         assert f"Rewards come from the router {run_folder(trained) / name}" in printed
+        assert "has no router of its own" not in printed
+
+
+@pytest.mark.slow
+def test_checkpoints_hold_the_router_of_their_moment(trained, tmp_path, capsys):
+    """After 320 of 480 steps it has not learned in the last epoch yet. A run without it plays with the last one."""
+    folder = run_folder(trained)
+    then, last = (load_policy(folder / name).state_dict() for name in ("router_320_steps.zip", "router.zip"))
+    assert then.keys() == last.keys() and any(not th.equal(then[key], last[key]) for key in then)
+    assert REINFORCE.load(folder / "rl_model_320_steps.zip").num_timesteps == 320
+    copied = tmp_path / "reinforce" / folder.name
+    shutil.copytree(folder, copied)
+    (copied / "router_320_steps.zip").unlink()
+    assert enjoy.main(["--env", ENV, "-f", str(tmp_path), "-n", "20", "--no-render", "--load-last-checkpoint"]) == 0
+    printed = capsys.readouterr().out
+    assert "rl_model_320_steps.zip has no router of its own: rewards come from the run's last one." in printed
+    assert f"Rewards come from the router {copied / 'router.zip'}" in printed
 
 
 @pytest.mark.slow
@@ -145,10 +167,13 @@ def test_evaluation_happens_once_per_epoch_on_other_instances(tmp_path):
 
 @pytest.mark.slow
 def test_help(capsys):
-    for main in (train.main, enjoy.main):
+    """The name of our command, our defaults, and the flags of rl_zoo3's."""
+    for main, prog in ((train.main, "train"), (enjoy.main, "enjoy")):
         with pytest.raises(SystemExit) as done:
-            main(["--help"])
-        assert done.value.code == 0 and "--algo" in capsys.readouterr().out
+            main(["--algo", "ppo_mask", "--help"])
+        printed = capsys.readouterr().out
+        assert done.value.code == 0 and printed.startswith(f"usage: sb3-uav {prog} [options]")
+        assert "--algo is reinforce" in printed and "--algo {a2c," in printed and "reinforce,ppo_mask}" in printed
 
 
 @pytest.mark.slow
@@ -314,7 +339,8 @@ def test_shipped_routers_build(name):
     for router in [its_of(entry)["router"] for entry in entries.values()]:
         settings = {key: value for key, value in router.items() if key not in ("algo", "n_envs", "policy")}
         assert router["algo"] == ("reinforce" if name == "paper" else name) and router["policy"] == "RouterPolicy"
-        resolve_algorithm(router["algo"])(RouterPolicy, env, device="cpu", **settings)
+        algorithm: Any = resolve_algorithm(router["algo"])
+        algorithm(RouterPolicy, env, device="cpu", **settings)
 
 
 def test_texts_become_numbers():

@@ -10,7 +10,6 @@ from sb3_uav.reinforce import REINFORCE
 pytest.importorskip("rl_zoo3")
 from tiny_zoo import ENV, its_with, run, write_config
 
-from sb3_uav.zoo import train
 from sb3_uav.zoo.configs import check_keys, read_yaml
 
 
@@ -122,9 +121,6 @@ def test_broken_configs_are_named(tmp_path, capsys):
         assert message in error and "broken.yml" in error
     assert run(tmp_path, tmp_path / "missing.yml") == 2
     assert "missing.yml" in capsys.readouterr().err
-    assert train.main(["--env", "TaskAllocation-U3-N21-v0"]) == 2
-    error = capsys.readouterr().err
-    assert "TaskAllocation-U3-N21-v0 not found in gym registry, you maybe meant TaskAllocation-U3-N20-v0?" in error
 
 
 def test_keys_that_are_no_text_are_named():

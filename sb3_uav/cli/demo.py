@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_uav.common.optional import require
-from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id
+from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id, ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
 
 _DESCRIPTION = "Train a small scenario through all phases of ITS, evaluate the pair beside heuristics, and draw figures."
@@ -34,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Report missing packages before the training.
     require_zoo("The demo", "rich.console", "tensorboard")
     require("matplotlib.figure", "The demo", "plots")
+    ensure_registered(args.env)
     from sb3_uav.studies.demo import evaluate_run, newest_run
     from sb3_uav.zoo.train import train
 

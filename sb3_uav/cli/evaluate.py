@@ -24,6 +24,8 @@ solvers:
     dl-drl:allocator=A.zip,router=R.zip,decode=sampling,samples=128      a trained pair
     dl-drl-i:allocator=A.zip,router=R.zip                                the same, named as in the paper (independent training)
     kmeans-am:router=R.zip                                               K-means and a trained router
+    sb3:zip=Z.zip,router=R.zip                                           any zip of our policies, step by step
+    sb3:zip=Z.zip,algo=ppo,trust=1                                       any other SB3 zip that you trust (it is unpickled)
 
 files in DIR:
   results.csv, schedules.jsonl    one line per solver and instance, written as soon as it is known

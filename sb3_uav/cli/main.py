@@ -15,6 +15,13 @@ from sb3_uav.common.errors import run_command
 _FORWARDED = {
     "train": ("sb3_uav.cli.train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
     "enjoy": ("sb3_uav.cli.enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
+    "record-video": ("sb3_uav.cli.record_video", "record a video of a trained agent (all flags of rl_zoo3's)"),
+    "benchmark": ("sb3_uav.cli.benchmark", "table of all agents of a log folder (all flags of rl_zoo3's benchmark)"),
+    "all-plots": ("sb3_uav.cli.all_plots", "curves and table of evaluations (all flags of rl_zoo3's all_plots)"),
+    "plot-train": ("sb3_uav.cli.plot_train", "curves of training episodes (all flags of rl_zoo3's plot_train)"),
+    "plot-from-file": ("sb3_uav.cli.plot_from_file", "figures from a file of all-plots (all flags of rl_zoo3's)"),
+    "push-to-hub": ("sb3_uav.cli.push_to_hub", "a trained agent and its router to the Hugging Face Hub"),
+    "load-from-hub": ("sb3_uav.cli.load_from_hub", "an agent of the Hugging Face Hub into a log folder"),
     "evaluate": ("sb3_uav.cli.evaluate", "evaluate zips and solvers on the same instances"),
     "anytime": ("sb3_uav.cli.anytime", "draw objective against time from an evaluation"),
     "reproduce": ("sb3_uav.cli.reproduce", "make the tables and figures of the paper"),

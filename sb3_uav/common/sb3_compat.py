@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from stable_baselines3.common import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -76,3 +77,15 @@ def forget_last_observation(model: OnPolicyAlgorithm) -> None:
     :param model: An on-policy algorithm
     """
     model._last_obs = None
+
+
+def replace_logger(model: BaseAlgorithm, logger: Logger) -> None:
+    """
+    Replace the logger until the next ``learn``, which makes a new one unless ``set_logger`` was called.
+
+    ``_setup_learn``: https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L430
+
+    :param model: Any SB3 algorithm
+    :param logger: Its new logger
+    """
+    model._logger = logger

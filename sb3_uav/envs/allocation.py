@@ -9,10 +9,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_uav.envs.generators import InstanceGenerator, make_generator
+from sb3_uav.envs.customization import make_reward, make_router, make_source, try_reward, try_router
+from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem, Stage
+from sb3_uav.envs.rewards import Reward, at_the_end, score_tours
 from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import sweep_order
@@ -43,11 +45,13 @@ class AllocationDynamics(Dynamics):
 
     :param instances: The instances
     :param router: Plans the tours of the reward
+    :param reward: Values the tours instead
     """
 
-    def __init__(self, instances: Instances, router: Router) -> None:
+    def __init__(self, instances: Instances, router: Router, reward: Reward | None = None) -> None:
         super().__init__(instances)
         self.router = router
+        self.reward = reward
         self._n_real = instances.task_mask.sum(1)[:, None]
 
     def reset(self, n_samples: int = 1) -> AllocationState:
@@ -73,7 +77,7 @@ class AllocationDynamics(Dynamics):
         rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
         rows = finished.any(1)
         if rows.any():
-            value = _planned_value(self.instances[rows], assignment[rows], self.router)
+            value = _planned_value(self.instances[rows], assignment[rows], self.router, self.reward)
             rewards[rows] = value.where(finished[rows], 0.0)
         return AllocationState(assignment, task, done, state.action_mask), rewards
 
@@ -171,14 +175,33 @@ def _useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Ins
     return replace(instances, n_uavs=instances.useful_fleet), numbered
 
 
-def _planned_value(instances: Instances, assignment: th.Tensor, router: Router) -> th.Tensor:
+def _planned_value(instances: Instances, assignment: th.Tensor, router: Router, reward: Reward | None = None) -> th.Tensor:
     """
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
-    :return: ``(batch, n_samples)`` float64, total value of the tasks on the planned tours
+    :param reward: Values the tours; the total value of the tasks on them when None
+    :return: ``(batch, n_samples)`` float64
     """
-    return plan_tours(*_useful_allocation(instances, assignment), router).value
+    instances, assignment = _useful_allocation(instances, assignment)
+    planned = plan_tours(instances, assignment, router)
+    return planned.value if reward is None else score_tours(reward, instances, planned.tours)
+
+
+def _alternating(instances: Instances) -> th.Tensor:
+    """
+    :param instances: ``batch`` instances
+    :return: ``(batch, 1, n_tasks)`` int64, an allocation to try things out: all tasks to the first UAV in even rows, to all in
+        turn in odd ones
+    """
+    in_turn = th.arange(instances.n_tasks, device=instances.device) % instances.useful_fleet
+    odd = th.arange(len(instances), device=instances.device)[:, None, None] % 2
+    return (in_turn * odd).contiguous()
+
+
+def _subsets_to_try(instances: Instances) -> Instances:
+    """:return: The single-UAV instances of that allocation, some of them without tasks"""
+    return split_tasks(*_useful_allocation(instances, _alternating(instances))).instances
 
 
 def schedules(tours: th.Tensor) -> list[Schedule]:
@@ -196,13 +219,20 @@ class AllocationProblem(Problem):
     :param generator: Draws the instances
     :param router: Plans the tours of the reward; nearest feasible task when None
     :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot
+    :param reward: Values complete schedules, in place of the total value of the tasks on their tours
     :raises ValueError: If the order is unknown
     """
 
     running_stage = Stage.ASSIGNING
 
-    def __init__(self, generator: InstanceGenerator, router: Router | None = None, task_order: str = "input") -> None:
-        super().__init__(generator)
+    def __init__(
+        self,
+        generator: InstanceGenerator,
+        router: Router | None = None,
+        task_order: str = "input",
+        reward: Reward | None = None,
+    ) -> None:
+        super().__init__(generator, reward)
         self.router: Router = router or nearest_feasible
         self.task_order = task_order
 
@@ -233,7 +263,7 @@ class AllocationProblem(Problem):
 
     def dynamics(self, instances: Instances) -> AllocationDynamics:
         # Looked up at every call, so that a router set during an episode takes effect.
-        return AllocationDynamics(instances, lambda subsets: self.router(subsets))
+        return AllocationDynamics(instances, lambda subsets: self.router(subsets), self.reward)
 
     def observe(self, dynamics: AllocationDynamics, state: AllocationState) -> dict[str, th.Tensor]:
         return {
@@ -243,12 +273,10 @@ class AllocationProblem(Problem):
         }
 
     def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
-        return _planned_value(instances, actions, self.router)
+        return _planned_value(instances, actions, self.router, self.reward)
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
-        rewards = th.zeros(actions.shape, dtype=returns.dtype, device=returns.device)
-        last = self.lengths(instances, actions) - 1
-        return rewards.scatter(-1, last[..., None], returns[..., None])
+        return at_the_end(returns, self.lengths(instances, actions), actions.shape[-1])
 
     def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
         # An instance without tasks ends only after a first step that does nothing.
@@ -268,18 +296,23 @@ class AllocationProblem(Problem):
 
 class TaskAllocationEnv(ProblemEnv):
     """
-    Task allocation as a Gymnasium environment (``TaskAllocation-U{V}-N{N}-v0``).
+    Task allocation as a Gymnasium environment (``TaskAllocation-U{V}-N{N}-v0``, ``TaskAllocation-v0``).
+
+    What is given by a dotted path, as in a YAML, is described in :mod:`sb3_uav.envs.customization`, and tried out here.
 
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
+    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, or a function of the user
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
-    :param generator: Any other source of instances
-    :param router: Plans the tours of the reward; nearest feasible task when None
+    :param generator: Any other source of instances, or what makes it
+    :param router: Plans the tours of the reward: a function, a zip, or the name of a trained pair; nearest feasible task when
+        None. Callbacks that train or load a router replace it
     :param task_order: ``"input"``, or ``"sweep"`` to present the tasks in the order of a sweep around the depot, which
         allocators with ``sweep`` expect
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
+    :param reward: Values complete schedules, in place of the total value of the tasks on their tours
+    :raises ValueError: If an argument cannot be used; the message names it, its value and what to do
     """
 
     problem: AllocationProblem
@@ -289,15 +322,22 @@ class TaskAllocationEnv(ProblemEnv):
         n_tasks: int = 20,
         n_uavs: int = 4,
         max_distance: float = 2.0,
-        distribution: str = "uniform",
+        distribution: Any = "uniform",
         instances: Any = None,
-        generator: InstanceGenerator | None = None,
-        router: Router | None = None,
+        generator: Any = None,
+        router: Any = None,
         task_order: str = "input",
         render_mode: str | None = None,
+        reward: Any = None,
     ) -> None:
-        generator = generator or make_generator(n_tasks, n_uavs, max_distance, distribution, instances)
-        super().__init__(AllocationProblem(generator, router, task_order), render_mode)
+        source = make_source(n_tasks, n_uavs, max_distance, distribution, instances, generator)
+        planner = make_router(router)
+        problem = AllocationProblem(source, planner, task_order, make_reward(reward))
+        if planner is not None:
+            try_router(router, planner, _subsets_to_try, source)
+        if problem.reward is not None:
+            try_reward(reward, lambda drawn: problem.returns(drawn, _alternating(drawn)), source)
+        super().__init__(problem, render_mode)
 
     def set_router(self, router: Router) -> None:
         """Use another router, starting with the next reward."""

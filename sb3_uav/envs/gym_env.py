@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 
 from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.instances import Instances
@@ -18,7 +19,8 @@ class ProblemEnv(gym.Env[Any, Any]):
 
     ``reset(options={"instance": instances[i]})`` plays a given instance. The legal actions are available in the observation
     (``action_mask``) and from :meth:`action_masks`. An illegal action does not raise an error: it is counted in
-    ``info["illegal_actions"]``, and the dynamics define its effect.
+    ``info["illegal_actions"]``, and the dynamics define its effect. The last ``info`` of an episode holds its return
+    (``objective``) and ``is_success``: whether every task that can count is visited (:meth:`Problem.successes`).
 
     :param problem: The problem
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
@@ -67,6 +69,9 @@ class ProblemEnv(gym.Env[Any, Any]):
         info: dict[str, Any] = {"illegal_actions": self._n_illegal}
         if terminated:
             info["objective"] = self._return
+            successes = self.problem.successes(self.instance, th.tensor([[self._return]], dtype=th.float64, device="cpu"))
+            if successes is not None:
+                info["is_success"] = bool(successes)
         if self.render_mode == "human":
             self.render()
         return self._observation(), reward, terminated, False, info

@@ -12,6 +12,10 @@ from gymnasium import spaces
 
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.rewards import Reward
+
+# Relative error of a sum of values in float64.
+_ROUNDING = 1e-9
 
 StateT = TypeVar("StateT", bound="_State")
 
@@ -76,6 +80,7 @@ class Problem(ABC):
     One level of the decomposition: its instances, spaces and dynamics.
 
     :param generator: Draws the instances
+    :param reward: Values complete schedules, in place of the total value of the visited tasks
     """
 
     observation_space: spaces.Dict
@@ -85,8 +90,9 @@ class Problem(ABC):
     # Whether the number of UAVs of an instance matters.
     uses_fleet: ClassVar[bool] = True
 
-    def __init__(self, generator: InstanceGenerator) -> None:
+    def __init__(self, generator: InstanceGenerator, reward: Reward | None = None) -> None:
         self.generator = generator
+        self.reward = reward
         self.action_space = self._action_space()
         self.observation_space = spaces.Dict({**self._static_spaces(), **self._dynamic_spaces()})
 
@@ -180,6 +186,24 @@ class Problem(ABC):
         :param actions: The legal actions so far
         :return: Task indices from 0, per UAV
         """
+
+    def successes(self, instances: Instances, returns: th.Tensor) -> th.Tensor | None:
+        """
+        Whether complete episodes are a success (``info["is_success"]``): every task that can count is visited.
+
+        A task can count if its value is above 0 and a UAV can fly from the depot to it and back within the maximum flight
+        distance. Most instances have more such tasks than a fleet can visit, so that a success rate of 0 is common; an
+        instance without any is always a success.
+
+        :param instances: ``batch`` instances
+        :param returns: ``(batch, n_samples)`` float64, undiscounted returns of complete episodes
+        :return: ``(batch, n_samples)`` bool; None with a reward of the user, which need not be about the values of tasks
+        """
+        if self.reward is not None:
+            return None
+        possible = (instances.values * instances.reachable()).sum(1)
+        # Returns may have been added up in another order.
+        return returns >= (1 - _ROUNDING) * possible[:, None]
 
     def arrange(self, instances: Instances) -> Instances:
         """

@@ -28,8 +28,9 @@ _LEGEND_COLUMNS = 2
 
 # Sides of the map, in units of the points' extent.
 _BORDER = 1.08
-# Inches: a figure, the frame around the map, and a line of the legend below it.
+# Inches: a figure, the frame around the map, a line of the legend below it, and the title above it.
 _FIGURE_WIDTH, FIGURE_HEIGHT, _MARGIN, LEGEND_LINE_HEIGHT = 5.0, 5.6, 0.15, 0.185
+_TITLE_HEIGHT = 0.25
 
 
 def require_matplotlib() -> Any:
@@ -174,16 +175,26 @@ class MapFigure:
         :param episodes: Running episodes
         :param row: Index of the episode to draw
         """
-        routes = episodes.routes(row)
+        self.draw_routes(episodes.instances[row], episodes.routes(row), episodes.stage(row))
+
+    def draw_routes(self, instance: Instances, routes: Sequence[Sequence[int]], stage: Stage, title: str = "") -> None:
+        """
+        Replace what is drawn.
+
+        :param instance: A batch of one
+        :param routes: Task indices from 0 per UAV
+        :param stage: Stage of the episode
+        :param title: Title of the map
+        """
         self.axes.clear()
-        draw_map(self.axes, episodes.instances, row, routes, stage=episodes.stage(row))
+        draw_map(self.axes, instance, 0, routes, title, stage)
         # Not tight_layout, which starts from the last layout and cuts off long legends.
         legend = 2 * _MARGIN + LEGEND_LINE_HEIGHT * legend_lines(routes)
         self.figure.subplots_adjust(
             left=_MARGIN / _FIGURE_WIDTH,
             right=1 - _MARGIN / _FIGURE_WIDTH,
             bottom=legend / FIGURE_HEIGHT,
-            top=1 - _MARGIN / FIGURE_HEIGHT,
+            top=1 - (_MARGIN + (_TITLE_HEIGHT if title else 0.0)) / FIGURE_HEIGHT,
         )
         self.axes.set_anchor("N")
 

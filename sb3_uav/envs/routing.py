@@ -9,11 +9,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_uav.envs.customization import make_reward, make_source, try_reward
 from sb3_uav.envs.distances import distance_limit, euclidean
-from sb3_uav.envs.generators import InstanceGenerator, make_generator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem, Stage
+from sb3_uav.envs.rewards import Reward, TourState, at_the_end, score_tours
 
 DEPOT = 0
 
@@ -94,6 +95,37 @@ class RoutingDynamics(Dynamics):
         return RoutingState(node, visited, traveled, done, self._action_mask(node, visited, traveled, done)), rewards
 
 
+class _ScoredDynamics(RoutingDynamics):
+    """
+    The same transitions with a reward of the user, given at the end of the episode.
+
+    :param instances: The instances
+    :param reward: The user's reward
+    """
+
+    def __init__(self, instances: Instances, reward: Reward) -> None:
+        super().__init__(instances)
+        self.reward = reward
+
+    def reset(self, n_samples: int = 1) -> Any:
+        shape = (len(self.instances), n_samples, self.instances.n_tasks + 1)
+        tour = th.full(shape, DEPOT - 1, dtype=th.int64, device=self.instances.device)
+        return TourState(*super().reset(n_samples), tour)
+
+    def step(self, state: Any, actions: th.Tensor) -> tuple[Any, th.Tensor]:
+        after, _ = super().step(RoutingState(*state[:-1]), actions)
+        # The depot is written too, as padding.
+        slot = (state.tour >= 0).sum(-1, keepdim=True)
+        tour = state.tour.scatter(-1, slot, after.position[..., None] - 1)
+        finished = after.done & ~state.done
+        rewards = th.zeros(finished.shape, dtype=th.float64, device=finished.device)
+        rows = finished.any(1)
+        if rows.any():
+            value = score_tours(self.reward, self.instances[rows], tour[rows][:, :, None])
+            rewards[rows] = value.where(finished[rows], 0.0)
+        return TourState(*after, tour), rewards
+
+
 def nearest_feasible(instances: Instances) -> th.Tensor:
     """
     Always fly to the nearest task that is still feasible; the default router of allocation environments.
@@ -126,7 +158,12 @@ def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
 
 
 class RoutingProblem(Problem):
-    """Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited."""
+    """
+    Route planning: one task (or the depot) is chosen per step; the reward is the value of the task visited.
+
+    :param generator: Draws the instances
+    :param reward: Values complete tours in place of that, at the end of the episode
+    """
 
     running_stage = Stage.FLYING
     uses_fleet = False
@@ -144,7 +181,7 @@ class RoutingProblem(Problem):
         }
 
     def dynamics(self, instances: Instances) -> RoutingDynamics:
-        return RoutingDynamics(instances)
+        return RoutingDynamics(instances) if self.reward is None else _ScoredDynamics(instances, self.reward)
 
     def observe(self, dynamics: RoutingDynamics, state: RoutingState) -> dict[str, th.Tensor]:
         remaining = dynamics.instances.max_distance[:, None] - state.traveled
@@ -156,9 +193,13 @@ class RoutingProblem(Problem):
         }
 
     def returns(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
+        if self.reward is not None:
+            return score_tours(self.reward, instances, actions[:, :, None] - 1)
         return collected_value(instances, actions)
 
     def step_rewards(self, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> th.Tensor:
+        if self.reward is not None:
+            return at_the_end(returns, self.lengths(instances, actions), actions.shape[-1])
         return collected_value(instances, actions[..., None])
 
     def lengths(self, instances: Instances, actions: th.Tensor) -> th.Tensor:
@@ -170,24 +211,32 @@ class RoutingProblem(Problem):
 
 class RoutePlanningEnv(ProblemEnv):
     """
-    Route planning of one UAV as a Gymnasium environment (``RoutePlanning-N{N}-v0``).
+    Route planning of one UAV as a Gymnasium environment (``RoutePlanning-N{N}-v0``, ``RoutePlanning-v0``).
+
+    What is given by a dotted path, as in a YAML, is described in :mod:`sb3_uav.envs.customization`, and tried out here.
 
     :param n_tasks: Number of tasks
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
+    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, or a function of the user
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
-    :param generator: Any other source of instances
+    :param generator: Any other source of instances, or what makes it
     :param render_mode: ``"human"``, ``"rgb_array"`` or None
+    :param reward: Values complete tours, in place of the value of the tasks on them
+    :raises ValueError: If an argument cannot be used; the message names it, its value and what to do
     """
 
     def __init__(
         self,
         n_tasks: int = 20,
         max_distance: float = 2.0,
-        distribution: str = "uniform",
+        distribution: Any = "uniform",
         instances: Any = None,
-        generator: InstanceGenerator | None = None,
+        generator: Any = None,
         render_mode: str | None = None,
+        reward: Any = None,
     ) -> None:
-        generator = generator or make_generator(n_tasks, 1, max_distance, distribution, instances)
-        super().__init__(RoutingProblem(generator), render_mode)
+        source = make_source(n_tasks, 1, max_distance, distribution, instances, generator)
+        problem = RoutingProblem(source, make_reward(reward))
+        if problem.reward is not None:
+            try_reward(reward, lambda drawn: problem.returns(drawn, nearest_feasible(drawn)[:, None]), source)
+        super().__init__(problem, render_mode)

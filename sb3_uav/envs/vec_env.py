@@ -9,13 +9,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_uav.envs.episodes import Episodes, given_instance
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.envs.problem import Problem
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.problem import Problem, Stage
 
 # Wrappers that change nothing; BatchedVecEnv keeps the episode statistics itself.
 _TRANSPARENT_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics)
@@ -94,6 +96,8 @@ class BatchedVecEnv(VecEnv):
         self._monitor = find_monitor(env)
         self._info_keywords: tuple[str, ...] = () if self._monitor is None else self._monitor.info_keywords
         self._windows: dict[int, Any] = {}
+        # Instance and routes of the episodes that ended in the last step, for rendering.
+        self._ended: dict[int, tuple[Instances, list[list[int]]]] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
         self._start_time = time.time()
         self._actions = np.zeros(len(env_fns), dtype=np.int64)
@@ -111,6 +115,7 @@ class BatchedVecEnv(VecEnv):
             if instance is not None:
                 given[row] = instance
         self.episodes.reset(given=given)
+        self._ended.clear()
         for counter in (self._episode_returns, self._episode_lengths, self._n_illegal):
             counter[:] = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -123,6 +128,7 @@ class BatchedVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         result = self.episodes.step(self._actions)
+        self._ended.clear()
         self._episode_returns += result.rewards
         self._episode_lengths += 1
         self._n_illegal += result.illegal
@@ -130,10 +136,16 @@ class BatchedVecEnv(VecEnv):
         finished = result.dones.nonzero()[0]
         observation = result.observation
         if len(finished) > 0:
-            for row in finished:
+            returns = th.from_numpy(self._episode_returns[finished])[:, None]
+            successes = self.problem.successes(self.episodes.instances[finished], returns)
+            if self.render_mode is not None:
+                self._ended = {row: (self.episodes.instances[row], self.episodes.routes(row)) for row in finished.tolist()}
+            for number, row in enumerate(finished):
                 infos[row]["terminal_observation"] = {key: value[row] for key, value in observation.items()}
                 infos[row]["TimeLimit.truncated"] = False
                 infos[row]["objective"] = float(self._episode_returns[row])
+                if successes is not None:
+                    infos[row]["is_success"] = bool(successes[number])
                 infos[row]["episode"] = self.episode_info(self._episode_returns[row], self._episode_lengths[row])
                 for key in self._info_keywords:
                     infos[row]["episode"][key] = infos[row][key]
@@ -199,9 +211,16 @@ class BatchedVecEnv(VecEnv):
         figure = MapFigure()
         images = []
         for row in rows:
-            figure.draw(self.episodes, row)
+            self._draw(figure, row)
             images.append(figure.rgb_array())
         return images
+
+    def _draw(self, figure: Any, row: int) -> None:
+        """The episode that has just ended, rather than the new one, whose beginning shows little."""
+        if row in self._ended:
+            figure.draw_routes(*self._ended[row], Stage.FINISHED)
+        else:
+            figure.draw(self.episodes, row)
 
     def _show(self, rows: Iterable[int]) -> None:
         from sb3_uav.envs.render import MapFigure
@@ -209,7 +228,7 @@ class BatchedVecEnv(VecEnv):
         for row in rows:
             if row not in self._windows:
                 self._windows[row] = MapFigure(interactive=True)
-            self._windows[row].draw(self.episodes, row)
+            self._draw(self._windows[row], row)
             self._windows[row].show()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

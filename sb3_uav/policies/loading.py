@@ -8,10 +8,12 @@ import os
 import pickle
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_uav.policies.allocator import AllocatorPolicy
@@ -28,6 +30,56 @@ _SIGNATURES: dict[str, type[EpisodicPolicy]] = {
 }
 # Stock A2C adds its optimizer class, which JSON cannot hold, to policy_kwargs; acting needs no optimizer.
 _IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
+
+
+class NotOurPolicyError(ValueError):
+    """An intact SB3 zip whose policy is not one of ours, or cannot be rebuilt without unpickling."""
+
+
+@dataclass(frozen=True)
+class StoredPolicy:
+    """
+    What an SB3 zip says of one of our policies, read without unpickling.
+
+    :param file: The zip
+    :param policy_class: ``AllocatorPolicy`` or ``RouterPolicy``
+    :param parameters: Its state dict, on the CPU, all numbers finite
+    :param attributes: The attributes of the algorithm as the JSON of the zip holds them
+    """
+
+    file: Path
+    policy_class: type[EpisodicPolicy]
+    parameters: dict[str, th.Tensor]
+    attributes: dict[str, Any]
+
+    @property
+    def policy_kwargs(self) -> dict[str, Any]:
+        """
+        What it was built with, apart from its optimizer.
+
+        :raises NotOurPolicyError: If some of it is stored as a pickle
+        """
+        return _plain_policy_kwargs(self.attributes, self.file)
+
+    def build(
+        self, observation_space: spaces.Space, action_space: spaces.Space, device: th.device | str = "cpu"
+    ) -> EpisodicPolicy:
+        """
+        :param observation_space: Observation space of an environment of the policy's level, of any size
+        :param action_space: Its action space
+        :param device: Device of the policy
+        :return: The policy for the step loop of that environment, in evaluation mode
+        """
+        policy = self.policy_class(observation_space, action_space, lambda _: 0.0, **self.policy_kwargs)
+        policy.load_state_dict(self.parameters)
+        policy.set_training_mode(False)
+        return policy.to(device)
+
+    @property
+    def n_uavs(self) -> int | None:
+        """The only fleet size that the network serves; None if it serves any."""
+        bound = "features_extractor.project_context.weight" in self.parameters
+        return len(self.parameters["action_net.weight"]) if bound and "action_net.weight" in self.parameters else None
 
 
 @overload
@@ -55,11 +107,35 @@ def load_policy(
     :raises ValueError: If the file is damaged, is not the zip of one of our policies or of another one than expected, or
         holds numbers that are not finite; the message names the file and the remedy
     """
+    stored = read_policy(path, expected)
+    policy_kwargs = stored.policy_kwargs
+    try:
+        policy = stored.policy_class.from_parameters(stored.parameters, policy_kwargs, "cpu")
+    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
+        raise misfit(stored, policy_kwargs, error) from error
+    try:
+        return policy.to(get_device(device))
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device is {str(device)!r}, which cannot be used ({reason}); try 'cpu' or 'auto'.") from error
+
+
+def read_policy(path: str | os.PathLike[str], expected: type[EpisodicPolicy] | None = None) -> StoredPolicy:
+    """
+    Read what :func:`load_policy` builds a policy from.
+
+    :param path: As of :func:`load_policy`
+    :param expected: As of :func:`load_policy`
+    :return: The stored policy
+    :raises FileNotFoundError: If there is no such file
+    :raises NotOurPolicyError: If an intact zip holds another kind of policy
+    :raises ValueError: As :func:`load_policy`
+    """
     file = _existing_file(Path(path))
     data, parameters = _read_zip(file)
     policy_class = next((cls for key, cls in _SIGNATURES.items() if key in parameters), None)
     if policy_class is None:
-        raise ValueError(
+        raise NotOurPolicyError(
             f"{file}: holds the policy of another kind (its first parameter is {next(iter(parameters), 'missing')!r}); "
             "give a zip that was trained with AllocatorPolicy or RouterPolicy."
         )
@@ -72,20 +148,21 @@ def load_policy(
         if not th.isfinite(parameter).all():
             found = parameter[~th.isfinite(parameter)].flatten()[0].item()
             raise ValueError(f"{file}: parameter '{name}' holds {found}; the training diverged, use an earlier checkpoint.")
-    policy_kwargs = _plain_policy_kwargs(data, file)
-    try:
-        policy = policy_class.from_parameters(parameters, policy_kwargs, "cpu")
-    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"{file}: parameters and policy_kwargs {policy_kwargs} do not fit together ({reason:.300}); "
-            "the zip was edited, or was written by another version of sb3_uav."
-        ) from error
-    try:
-        return policy.to(get_device(device))
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"device is {str(device)!r}, which cannot be used ({reason}); try 'cpu' or 'auto'.") from error
+    return StoredPolicy(file, policy_class, parameters, data)
+
+
+def misfit(stored: StoredPolicy, policy_kwargs: dict[str, Any], error: Exception) -> ValueError:
+    """
+    :param stored: A stored policy
+    :param policy_kwargs: The arguments that it was built with now
+    :param error: What went wrong then
+    :return: The error to raise
+    """
+    reason = " ".join(str(error).split())
+    return ValueError(
+        f"{stored.file}: parameters and policy_kwargs {policy_kwargs} do not fit together ({reason:.300}); "
+        "the zip was edited, or was written by another version of sb3_uav."
+    )
 
 
 def _existing_file(path: Path) -> Path:
@@ -151,7 +228,7 @@ def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
         # Beside the pickle of a dictionary, SB3 writes its plain items as they are and the others as their repr.
         pickled = sorted(key for key, value in policy_kwargs.items() if isinstance(value, str) and "<" in value)
         if pickled or "dict" not in str(stored.get(":type:")):
-            raise ValueError(
+            raise NotOurPolicyError(
                 f"{file}: policy_kwargs {pickled or stored.get(':type:')} are Python objects, stored as a pickle, which is "
                 "not executed here; train with plain numbers, strings and lists in policy_kwargs, or, if you trust the file, "
                 "load it with the algorithm's own load() and use model.policy."

@@ -1,14 +1,24 @@
 """
 Trained pairs that come with the package, each in a folder of its own beside its model card.
 
-``allocator.zip`` and ``router.zip`` are ordinary SB3 zips without the state of their optimizers.
+``allocator.zip`` and ``router.zip`` are ordinary SB3 zips without the state of their optimizers. To predict or to go on
+learning with one of them, on an environment of any size::
+
+    from sb3_uav import pretrained
+
+    model = pretrained.load("universal", level="allocator", env=env)
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["files", "names", "pair_files"]
+if TYPE_CHECKING:
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+    from stable_baselines3.common.type_aliases import GymEnv
+
+__all__ = ["files", "load", "names", "pair_files"]
 
 DEFAULT_PAIR = "universal"
 ALLOCATOR_FILE, ROUTER_FILE = "allocator.zip", "router.zip"
@@ -50,3 +60,55 @@ def pair_files(allocator: str | None = None, router: str | None = None) -> tuple
             f"{given} is one zip of a pair, and its {missing} is missing: give both, or the name of a pair, one of {names()}."
         )
     return Path(allocator), Path(router)
+
+
+def load(
+    name: str = DEFAULT_PAIR,
+    level: str = "allocator",
+    env: GymEnv | str | None = None,
+    algorithm: str | type[OnPolicyAlgorithm] = "reinforce",
+    router: str | Path | None = None,
+    **kwargs: Any,
+) -> Any:
+    """
+    One of the networks of a pair as an SB3 algorithm, which predicts and learns on an environment of any size.
+
+    The environment of an allocator gets the pair's router for its rewards and presents the tasks in the allocator's order,
+    from its next ``reset`` on. The settings are those for fine-tuning, see
+    :func:`~sb3_uav.reinforce.transfer.fine_tuning_settings`: a learning rate of 1e-4, for ``REINFORCE`` 8 samples per
+    instance with their mean as the baseline, for PPO rollouts of whole episodes without discount. Any argument of the
+    algorithm replaces them. Counters start from 0, and the optimizer is fresh.
+
+    :param name: Name of a pair
+    :param level: ``"allocator"`` for a ``TaskAllocation`` environment, or ``"router"`` for a ``RoutePlanning`` one
+    :param env: The environment (if registered in Gym, can be str)
+    :param algorithm: ``"reinforce"``, ``"ppo"``, ``"ppo_mask"``, ``"a2c"``, or the class or dotted path of another on-policy
+        algorithm
+    :param router: Zip of another router for the rewards, with ``level="allocator"``
+    :param kwargs: Arguments of the algorithm, and ``policy_kwargs`` that replace those of the zip
+    :return: A new model of that algorithm
+    :raises FileNotFoundError: If there is no such zip
+    :raises ValueError: If there is no such pair or level, or the environment is missing or none of ours of that level
+    """
+    from stable_baselines3.common.base_class import maybe_make_env
+
+    from sb3_uav.policies import RouterPolicy
+    from sb3_uav.policies.loading import load_policy
+    from sb3_uav.reinforce import transfer
+
+    if level not in ("allocator", "router"):
+        raise ValueError(f"level is {level!r}; choose 'allocator' or 'router'.")
+    if router is not None and level == "router":
+        raise ValueError(f"router is {str(router)!r}, but only the rewards of an allocator come from a router; leave it out.")
+    allocator_file, router_file = files(name)
+    made: Any = maybe_make_env(env, 0)  # type: ignore[arg-type]
+    if made is None:
+        raise ValueError("env is missing; give the environment to predict or to learn on, of any size.")
+    path = allocator_file if level == "allocator" else router_file
+    # What cannot be learned on is refused before settings are looked up for it.
+    transfer.require_fit(path, made)
+    model = transfer.load(path, made, algorithm, **{**transfer.fine_tuning_settings(algorithm, made), **kwargs})
+    if level == "allocator":
+        planner = load_policy(router or router_file, model.device, RouterPolicy)
+        model.env.env_method("set_router", planner.plan)
+    return model

@@ -1,14 +1,12 @@
-"""Names of on-policy algorithms, and objects by their dotted path."""
+"""Names of on-policy algorithms."""
 
 from __future__ import annotations
-
-from importlib import import_module
-from typing import Any
 
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_uav.common.imports import import_object
 from sb3_uav.reinforce import REINFORCE
 
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
@@ -19,22 +17,10 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
 }
 
 
-def import_object(path: str) -> Any:
-    """
-    :param path: ``package.module.name``
-    :return: The object
-    :raises ValueError: If there is none
-    """
-    module_name, _, name = path.rpartition(".")
-    try:
-        return getattr(import_module(module_name), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(str(error)) from error
-
-
-def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
+def resolve_algorithm(name: str, what: str = "router: algo") -> type[OnPolicyAlgorithm]:
     """
     :param name: ``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or a dotted path
+    :param what: Where it was given, as errors name it
     :return: The class of the algorithm
     :raises ValueError: If there is no such on-policy algorithm
     """
@@ -44,7 +30,7 @@ def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:
         algorithm = import_object(name)
     except ValueError as error:
         choices = ", ".join(ALGORITHMS)
-        raise ValueError(f"router: algo is {name!r}; choose one of {choices} or give a dotted path.") from error
+        raise ValueError(f"{what} is {name!r}; choose one of {choices} or give a dotted path.") from error
     if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
-        raise ValueError(f"router: algo {name!r} is not an on-policy algorithm of SB3.")
+        raise ValueError(f"{what} {name!r} is not an on-policy algorithm of SB3.")
     return algorithm

@@ -39,6 +39,33 @@ class EpisodeBatch(NamedTuple):
         return collected.flip(-1).cumsum(-1).flip(-1).float()
 
 
+class PlayedEpisodes(NamedTuple):
+    """
+    Results of one complete episode per instance.
+
+    :param returns: ``(batch,)`` float64
+    :param lengths: ``(batch,)`` int64, lengths in environment steps
+    :param successes: ``(batch,)`` bool, ``is_success`` of the episodes; None where it is undefined
+    """
+
+    returns: np.ndarray
+    lengths: np.ndarray
+    successes: np.ndarray | None = None
+
+
+def episodes_by_sample(problem: Problem, instances: Instances, actions: th.Tensor, returns: th.Tensor) -> list[PlayedEpisodes]:
+    """
+    :param problem: The problem that was played
+    :param instances: ``batch`` instances
+    :param actions: ``(batch, n_samples, n_steps)`` int64
+    :param returns: ``(batch, n_samples)`` float64
+    :return: The results of each of the ``n_samples``
+    """
+    fields = [returns, problem.lengths(instances, actions), problem.successes(instances, returns)]
+    columns = [[None] * returns.shape[1] if field is None else field.T.cpu().numpy() for field in fields]
+    return [PlayedEpisodes(*sample) for sample in zip(*columns, strict=True)]
+
+
 class Step(NamedTuple):
     """
     One step of ``batch`` environments in the form of a ``VecEnv``.
@@ -53,20 +80,22 @@ class Step(NamedTuple):
     infos: list[dict[str, Any]]
 
 
-def steps_of_episodes(returns: np.ndarray, lengths: np.ndarray, n_steps: int) -> Iterator[Step]:
+def steps_of_episodes(played: PlayedEpisodes, n_steps: int) -> Iterator[Step]:
     """
     Distribute played episodes over the steps of a ``VecEnv``.
 
-    :param returns: ``(batch,)``, episode returns
-    :param lengths: ``(batch,)``, episode lengths in environment steps
+    :param played: Episodes of ``batch`` instances
     :param n_steps: Number of ``VecEnv`` steps, at least 1
     :return: The steps; all episodes end in the last one
     """
-    batch = len(returns)
+    batch = len(played.returns)
     for _ in range(n_steps - 1):
         yield Step(np.zeros(batch, np.float32), np.zeros(batch, bool), [{} for _ in range(batch)])
-    infos = [
+    infos: list[dict[str, Any]] = [
         {"objective": episode_return, "illegal_actions": 0, "episode": {"r": episode_return, "l": length}}
-        for episode_return, length in zip(returns.tolist(), lengths.tolist(), strict=True)
+        for episode_return, length in zip(played.returns.tolist(), played.lengths.tolist(), strict=True)
     ]
-    yield Step(returns.astype(np.float32), np.ones(batch, bool), infos)
+    if played.successes is not None:
+        for info, is_success in zip(infos, played.successes.tolist(), strict=True):
+            info["is_success"] = is_success
+    yield Step(played.returns.astype(np.float32), np.ones(batch, bool), infos)

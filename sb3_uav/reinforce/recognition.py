@@ -59,6 +59,8 @@ def _recognize(env: VecEnv) -> Problem | str:
             )
         if getattr(other, "router", None) != getattr(first, "router", None):
             return f"{rows} have different routers (env_method('set_router', router) gives all the same)"
+        if other.reward != first.reward:
+            return f"{rows} have different rewards"
     return first
 
 

@@ -15,7 +15,6 @@ from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
@@ -33,9 +32,10 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
 from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
+from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
-from sb3_uav.reinforce.episode_batch import EpisodeBatch, steps_of_episodes
+from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
 from sb3_uav.reinforce.finite import require_finite
 from sb3_uav.reinforce.monitor_rows import log_episodes
 from sb3_uav.reinforce.recognition import find_problem
@@ -49,7 +49,7 @@ NO_STEP_LIMIT = 2**62
 _NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
-class REINFORCE(OnPolicyAlgorithm):
+class REINFORCE(AnySizeAlgorithm):
     """
     REINFORCE with a choice of baselines.
 
@@ -269,27 +269,25 @@ class REINFORCE(OnPolicyAlgorithm):
         with th.no_grad():
             returns = problem.returns(instances, actions)
             baseline = self._baseline.of_episodes(problem, instances, returns)
-        lengths = problem.lengths(instances, actions)
-        if not self._report_episodes(env, callback, returns.cpu().numpy(), lengths.cpu().numpy()):
+        if not self._report_episodes(env, callback, episodes_by_sample(problem, instances, actions, returns)):
             return False
         self._batch = EpisodeBatch(instances, cache, actions, returns, baseline)
         callback.on_rollout_end()
         return True
 
-    def _report_episodes(self, env: VecEnv, callback: BaseCallback, returns: np.ndarray, lengths: np.ndarray) -> bool:
+    def _report_episodes(self, env: VecEnv, callback: BaseCallback, samples: list[PlayedEpisodes]) -> bool:
         """
         Count the steps and call the callbacks as SB3's loop does, once per ``n_envs`` steps.
 
-        :param returns: ``(batch, n_samples)``, episode returns
-        :param lengths: ``(batch, n_samples)``, episode lengths in steps
+        :param samples: The episodes of each sample, one per instance
         :return: False if a callback stops the training
         """
-        for sample_returns, sample_lengths in zip(returns.T, lengths.T, strict=True):
-            n_played = int(sample_lengths.sum())
+        for played in samples:
+            n_played = int(played.lengths.sum())
             n_calls = max(math.ceil((n_played - self.steps_ahead) / self.n_envs), 1)
             self.steps_ahead += n_calls * self.n_envs - n_played
             # Callbacks find rewards, dones and infos among the local variables, as in SB3's loop.
-            for rewards, dones, infos in steps_of_episodes(sample_returns, sample_lengths, n_calls):  # noqa: B007
+            for rewards, dones, infos in steps_of_episodes(played, n_calls):  # noqa: B007
                 self.num_timesteps += self.n_envs
                 if dones.all():
                     log_episodes(env, infos)

@@ -46,13 +46,25 @@ class KMeansAM(BatchedSolver):
     def solve_batch(
         self, instances: Instances, rows: Sequence[int], seed: int, time_limit: float | None = None
     ) -> list[Schedule]:
-        assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
-        for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
-            if n_tasks > 0:
-                points = instances.tasks[i, :n_tasks].numpy()
-                clusters = kmeans(points, instances.n_uavs, keyed_generator(seed, row), self.restarts)
-                assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
+        assignment = kmeans_assignment(instances, rows, seed, self.restarts)
         return schedules(plan_tours(instances, assignment, self.router.plan).tours[:, 0])
+
+
+def kmeans_assignment(instances: Instances, rows: Sequence[int], seed: int, restarts: int) -> th.Tensor:
+    """
+    :param instances: ``batch`` instances on the CPU, real tasks first
+    :param rows: Their row indices in the solved batch
+    :param seed: Seed for all random numbers
+    :param restarts: Number of starts of K-means
+    :return: ``(batch, 1, n_tasks)`` int64, the UAV of each task by its cluster
+    """
+    assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
+    for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
+        if n_tasks > 0:
+            points = instances.tasks[i, :n_tasks].numpy()
+            clusters = kmeans(points, instances.n_uavs, keyed_generator(seed, row), restarts)
+            assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
+    return assignment
 
 
 def load_kmeans_am(router: str, restarts: int = 10, device: str = "auto", batch_size: int | None = None) -> KMeansAM:

@@ -18,6 +18,8 @@ SOLVERS: dict[str, str] = {
     # The paper's name for pairs whose router was not trained with the allocator.
     "dl-drl-i": "sb3_uav.solvers.dl_drl:load_dl_drl_i",
     "kmeans-am": "sb3_uav.solvers.kmeans_am:load_kmeans_am",
+    # Any other zip of SB3, on the step loop of its environment.
+    "sb3": "sb3_uav.solvers.sb3_zip:load_sb3",
     "greedy-insertion": "sb3_uav.solvers.insertion:GreedyInsertion",
     "milp": "sb3_uav.solvers.milp:MILP",
     "ortools": "sb3_uav.solvers.ortools_routing:ORTools",

@@ -6,6 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,9 +17,11 @@ from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import FIXED_SET_STREAM, random_stream
 from sb3_uav.common.sb3_compat import n_updates
+from sb3_uav.common.tensorboard import hyperparameters, record_hyperparameters, record_picture, shows_pictures
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
+from sb3_uav.policies.greedy_map import greedy_map
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, BestPair, BestPairOwner, best_model_folder, find_best_router, take_over
@@ -58,7 +61,9 @@ class FixedSetEvalCallback(BestPairOwner):
     that the environment has at that time; name this callback after ``ITSCallback``.
 
     It logs ``eval/fixed_greedy``, ``eval/fixed_sampled``, ``eval/fixed_best`` and ``eval/fixed_ep_length``, for ``sizes`` or
-    several sets also ``size_grid/U4-N80`` and so on, and writes into the run folder:
+    several sets also ``size_grid/U4-N80`` and so on. TensorBoard also gets ``eval/schedule``, a map of the greedy schedule of
+    the first instance (if matplotlib is installed), and the settings of the training with these values in its HPARAMS tab.
+    It writes into the run folder:
 
     - ``evaluations.npz`` in SB3's format (returns of the greedy episodes, set after set) with more arrays, see
       :class:`~sb3_uav.training.fixed_set_history.EvaluationHistory`;
@@ -148,6 +153,7 @@ class FixedSetEvalCallback(BestPairOwner):
         self._learned_steps = 0
         self._evaluated_epoch = 0
         self._evaluated_updates = 0
+        self._described_in: str | None = ""
         self._fingerprint = ""
         # A clock that stands still during evaluations: wall and CPU seconds when it showed 0.
         self._clock_start = np.zeros(2)
@@ -198,6 +204,19 @@ class FixedSetEvalCallback(BestPairOwner):
         self._evaluated_updates = n_updates(self.model)
         self._note_state(self._now() - self._clock_start)
         self._ready = True
+
+    def _describe(self) -> None:
+        """Record the settings of the training, for TensorBoard."""
+        settings = hyperparameters(self.model)
+        settings["preset"] = (self.model.policy_kwargs or {}).get("preset", "default")
+        settings["network"] = asdict(self._policy.settings)
+        if (its := self._its) is not None:
+            settings["its"] = {"strategy": its.strategy, **asdict(its.schedule)}
+            settings["its"]["warm_start"] = {} if its.warm_start is None else its.warm_start.arguments
+            network: Any = its.router.policy
+            settings["router"] = {**hyperparameters(its.router), "network": asdict(network.settings)}
+        metrics = ["eval/fixed_greedy", "eval/fixed_best", *(["eval/fixed_sampled"] if self.n_samples > 0 else [])]
+        record_hyperparameters(self.logger, settings, metrics)
 
     def _find_policy_and_problem(self) -> tuple[EpisodicPolicy, Problem]:
         policy: Any = self.model.policy
@@ -407,6 +426,9 @@ class FixedSetEvalCallback(BestPairOwner):
             self.logger.record(f"size_grid/{name}", mean)
 
     def _report(self, result: FixedSetResult, improved: bool) -> None:
+        if self._described_in != self.logger.dir:
+            self._describe()
+            self._described_in = self.logger.dir
         text = f"greedy {result.greedy.mean():.2f}"
         self.logger.record("eval/fixed_greedy", float(result.greedy.mean()))
         if self.n_samples > 0:
@@ -414,6 +436,9 @@ class FixedSetEvalCallback(BestPairOwner):
             self.logger.record("eval/fixed_sampled", float(result.sampled.mean()))
         self.logger.record("eval/fixed_best", self.best_mean_reward)
         self.logger.record("eval/fixed_ep_length", float(result.lengths.mean()))
+        if self.sets is not None and shows_pictures(self.logger):
+            first = next(iter(self.sets.sets.values()))[0]
+            record_picture(self.logger, "eval/schedule", greedy_map(self._policy, self._problem, first))
         if self.verbose > 0:
             print(f"Fixed set after {self._timesteps} steps: {text}{' (new best)' if improved else ''}")
         # As SB3's EvalCallback does, so that the values stand at their own step.

@@ -47,6 +47,7 @@ def imitate(
     report: Callable[[str], None] = lambda _: None,
     folder: str | Path | None = None,
     share: float = 1.0,
+    record: Callable[[int, float], None] = lambda n_moves, nats: None,
 ) -> None:
     """
     Train a router on the tours of local search, by the likelihood of their moves.
@@ -66,6 +67,8 @@ def imitate(
     :param folder: Folder for the progress. Calling again with the same arguments resumes from it, with the same result as
         without an interruption
     :param share: Part of ``n_subsets`` and ``n_updates`` to do, above 0 and at most 1
+    :param record: Called as often with the number of moves learned from so far, those before an interruption included, and
+        the mean loss since the last call in nats per move
     :raises ImportError: If numba is not installed
     :raises OSError: If the progress cannot be written
     :raises ValueError: If a number is not above 0, or the folder holds the progress of other settings or damaged files
@@ -78,7 +81,7 @@ def imitate(
     progress = None if folder is None else ImitationProgress(Path(folder), settings)
     lessons = _search_lessons(allocator, generator, rng, n_subsets, batch_size, report, progress)
     optimizer = th.optim.Adam(router.parameters(), learning_rate)
-    n_done = 0 if progress is None else progress.restore_updates(router, optimizer, rng)
+    n_done, n_learned = (0, 0) if progress is None else progress.restore_updates(router, optimizer, rng)
     if n_done > 0:
         report(f"imitation: resumed after {n_done} of {n_updates} updates")
     start, total, n_moves = time.perf_counter(), th.zeros((), dtype=th.float32, device=router.device), 0
@@ -97,13 +100,14 @@ def imitate(
         loss.backward()
         th.nn.utils.clip_grad_norm_(router.parameters(), _MAX_GRAD_NORM)
         optimizer.step()
-        total, n_moves = total + n_new * loss.detach(), n_moves + n_new
+        total, n_moves, n_learned = total + n_new * loss.detach(), n_moves + n_new, n_learned + n_new
         if update % _REPORT_EVERY == 0 or update == n_updates:
             seconds, nats = time.perf_counter() - start, total.item() / max(n_moves, 1)
             report(f"imitation: {update} of {n_updates} updates, {nats:.3f} nats a move, {seconds:.0f} s")
+            record(n_learned, nats)
             total, n_moves = th.zeros_like(total), 0
         if progress is not None and update % _SAVE_EVERY == 0:
-            progress.save_updates(update, router, optimizer, rng)
+            progress.save_updates(update, n_learned, router, optimizer, rng)
     router.set_training_mode(False)
 
 

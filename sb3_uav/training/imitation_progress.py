@@ -73,39 +73,43 @@ class ImitationProgress:
         return lessons
 
     def save_updates(
-        self, n_updates: int, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator
+        self, n_updates: int, n_moves: int, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator
     ) -> None:
         """
         :param n_updates: Number of updates so far
+        :param n_moves: Number of moves learned from so far
         :param router: The policy in training
         :param optimizer: Its optimizer
         :param rng: The generator that selects lessons
         :raises OSError: If the file cannot be written
         """
-        learned = {"n_updates": n_updates, "router": router.state_dict(), "optimizer": optimizer.state_dict()}
-        self._write(self.folder / "updates.pt", rng, learned)
+        counts = {"n_updates": n_updates, "n_moves": n_moves}
+        states = {"router": router.state_dict(), "optimizer": optimizer.state_dict()}
+        self._write(self.folder / "updates.pt", rng, {**counts, **states})
 
-    def restore_updates(self, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator) -> int:
+    def restore_updates(
+        self, router: RouterPolicy, optimizer: th.optim.Optimizer, rng: np.random.Generator
+    ) -> tuple[int, int]:
         """
         :param router: Receives the saved parameters
         :param optimizer: Receives the saved state
         :param rng: Set to its saved state
-        :return: Number of saved updates
+        :return: Numbers of saved updates and moves; 0 moves if an older version saved them
         :raises ValueError: If the file is damaged or belongs to other settings or another network
         """
         path = self.folder / "updates.pt"
         content = self._read(path, rng)
         if content is None:
-            return 0
-        n_updates = content.get("n_updates")
-        if not isinstance(n_updates, int) or not {"router", "optimizer"} <= content.keys():
+            return 0, 0
+        n_updates, n_moves = content.get("n_updates"), content.get("n_moves", 0)
+        if not isinstance(n_updates, int) or not isinstance(n_moves, int) or not {"router", "optimizer"} <= content.keys():
             raise self._damaged(path, f"n_updates is {n_updates!r}, the fields are {sorted(map(str, content))}")
         try:
             router.load_state_dict(content["router"])
             optimizer.load_state_dict(content["optimizer"])
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: of another network ({error}); remove {self.folder} to start again.") from error
-        return n_updates
+        return n_updates, n_moves
 
     def _chunk_file(self) -> Path:
         return self.folder / f"lessons_{self._n_chunks}.pt"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import warnings
 from pathlib import Path
@@ -15,11 +16,14 @@ from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, M
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
+from sb3_uav.common.router_progress import router_progress
 from sb3_uav.common.sb3_compat import n_updates, total_timesteps
+from sb3_uav.common.shared_axis import SharedAxis
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.freezing import Freezer
+from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.recognition import find_problem
 from sb3_uav.training.arguments import check_counts
@@ -35,7 +39,6 @@ from sb3_uav.training.its_checkpoint import (
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
 from sb3_uav.training.router_handover import hand_over_router
-from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import find_run_folder
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_large_batches
@@ -43,6 +46,7 @@ from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
 ROUTER_FILE = "router.zip"
+_PRETRAINING_EPOCHS = 5
 
 
 class ITSCallback(RouterCallback):
@@ -61,17 +65,23 @@ class ITSCallback(RouterCallback):
     ``checkpoint_freq``-th one of the allocator. With ``REINFORCE`` and constant learning rates (``lr_decay`` included) a
     resumed run ends with the same result as an uninterrupted one.
 
+    Both levels log on one axis, that of the steps that either of them has learned from: environment steps, and in the warm
+    start the moves that are imitated. The router's TensorBoard events are in the folder ``router`` of the allocator's.
+
     :param router: The router's algorithm: ``algo`` (``reinforce``, ``ppo``, ``ppo_mask``, ``a2c`` or the dotted path of an
-        on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``
+        on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``. Or a router that was
+        trained before, to go on with: its zip or the name of a pair such as ``"universal"``, with the settings of
+        :func:`~sb3_uav.reinforce.transfer.fine_tuning_settings`; or ``{"zip": "router.zip", ...}`` or ``{"pretrained":
+        "universal", ...}`` with other settings of the algorithm. The zip is read without unpickling
     :param warm_start: What trains the router before anything else: arguments of
         :func:`~sb3_uav.training.imitation.imitate`, as in ``{"n_updates": 1000}``; or the dotted path of another function and
         its arguments, as in ``{"my_package.start": {"n_steps": 10}}``. It is called with the policies of router and
-        allocator, the generator of the instances and a random generator. If it has the parameters ``report`` and ``folder``,
-        it gets a function to report its progress to, and a folder to keep it in (None without ``save_path``), from which an
-        interrupted run resumes; the folder is removed afterwards. If it has a parameter ``share``, it gets the part of the
-        planned steps that this run takes
+        allocator, the generator of the instances and a random generator. If it has the parameters ``report``, ``record`` and
+        ``folder``, it gets a function to report its progress to, one to log its loss with, and a folder to keep its progress
+        in (None without ``save_path``), from which an interrupted run resumes; the folder is removed afterwards. If it has a
+        parameter ``share``, it gets the part of the planned steps that this run takes
     :param n_epochs: Allocator epochs (the paper's E)
-    :param n_pretraining_epochs: Router epochs of pre-training (E_p)
+    :param n_pretraining_epochs: Router epochs of pre-training (E_p); when None 5, or none for a router that was trained before
     :param n_intensive_epochs: Allocator epochs of intensive training (E_t)
     :param n_continuous_epochs: Epochs in a row in intensive training (E_c)
     :param instances_per_epoch: Instances of an epoch, of both levels; that of the allocator's algorithm when None
@@ -89,9 +99,9 @@ class ITSCallback(RouterCallback):
 
     def __init__(
         self,
-        router: dict[str, Any],
+        router: dict[str, Any] | str | os.PathLike[str],
         n_epochs: int = 100,
-        n_pretraining_epochs: int = 5,
+        n_pretraining_epochs: int | None = None,
         n_intensive_epochs: int = 8,
         n_continuous_epochs: int = 4,
         instances_per_epoch: int | None = None,
@@ -105,15 +115,15 @@ class ITSCallback(RouterCallback):
     ) -> None:
         super().__init__(verbose)
         check_counts(1, n_epochs=n_epochs, n_continuous_epochs=n_continuous_epochs, checkpoint_freq=checkpoint_freq)
+        self.router_zip, self.router_kwargs = router_source(router)
+        if n_pretraining_epochs is None:
+            n_pretraining_epochs = _PRETRAINING_EPOCHS if self.router_zip is None else 0
         check_counts(0, n_pretraining_epochs=n_pretraining_epochs, n_intensive_epochs=n_intensive_epochs)
         check_counts(1, instances_per_epoch=instances_per_epoch, router_instances_per_epoch=router_instances_per_epoch)
-        if not isinstance(router, dict) or "policy" not in router:
-            raise ValueError(f"router must be a mapping with at least the key 'policy', found {router!r:.80}.")
         self.strategy = strategy_name(strategy)
         self.schedule = EpochSchedule.of(
             self.strategy, n_epochs, n_pretraining_epochs, n_intensive_epochs, n_continuous_epochs
         )
-        self.router_kwargs = dict(router)
         self.n_epochs = n_epochs
         self.instances_per_epoch = instances_per_epoch
         self.router_instances_per_epoch = router_instances_per_epoch
@@ -126,6 +136,7 @@ class ITSCallback(RouterCallback):
         self.epoch = 0
         self._trainer: RouterTrainer
         self._allocator_freezer: Freezer
+        self._axis = SharedAxis()
         self._statistics = EpisodeStatistics()
         self._subsets: AllocatedSubsets | None = None
         self._started = False
@@ -157,7 +168,10 @@ class ITSCallback(RouterCallback):
         self.instances_per_epoch = find_epoch_size(self.model, self.instances_per_epoch)
         if self.save_path is None:
             self.save_path = self._find_save_path()
-        if not self._started:
+        self._axis.begin(self.model)
+        if self._started:
+            self._axis.join(lambda: self.router)
+        else:
             # Before anything is drawn or saved, so that an unseeded run draws a seed and every zip of it has that seed.
             self._seed()
             warn_of_large_batches(self.model, self.instances_per_epoch, self.problem.generator.n_tasks)
@@ -190,6 +204,7 @@ class ITSCallback(RouterCallback):
             self.training_env.num_envs,
             self.problem.generator,
             self.router_instances_per_epoch or self.instances_per_epoch,
+            self.router_zip,
         )
         self._allocator_freezer = Freezer(self.model.policy)
         if self.resume_from is None:
@@ -199,8 +214,10 @@ class ITSCallback(RouterCallback):
         elif n_updates(self.model) > 0:
             raise ValueError(
                 "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
-                f"{CHECKPOINT_FOLDER} folder of the earlier run."
+                f"{CHECKPOINT_FOLDER} folder of the earlier run, or start a new one with its weights "
+                "(sb3_uav.reinforce.transfer.load) and a router that was trained before."
             )
+        self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
             self._start_router(self.warm_start)
         self._warm_started = True
@@ -212,9 +229,15 @@ class ITSCallback(RouterCallback):
             if self.verbose > 0:
                 print(text, flush=True)
 
+        def record(n_moves: int, nats: float) -> None:
+            self._axis.extra = n_moves
+            self.router.logger.record("imitation/nats_per_move", nats)
+            self.router.logger.dump(self.router.num_timesteps)
+
         folder = None if self.save_path is None else self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
         positional = (self._trainer.policy, self.model.policy, self.problem.generator, rng)
-        start = warm_start.bind(positional, {"report": report, "folder": folder, "share": self._share})
+        offered = {"report": report, "record": record, "folder": folder, "share": self._share}
+        start = warm_start.bind(positional, offered)
         if folder is not None:
             bring_progress(folder, None if self.resume_from is None else self.resume_from / WARM_START_FOLDER)
         # From here on an interrupted run can be resumed.
@@ -258,6 +281,7 @@ class ITSCallback(RouterCallback):
             self._end_epoch()
 
     def _on_step(self) -> bool:
+        self._axis.note()
         self._statistics.count(self.locals)
         return self.epoch < self.n_epochs
 
@@ -384,6 +408,10 @@ class ITSCallback(RouterCallback):
         self.records.append(record)
         self.logger.record(f"its/{level}_epoch", epoch)
         self.logger.record(f"its/{level}_objective", objective)
+        if level == "router":
+            # At its own step: the allocator may not log before several of these epochs are over.
+            self.logger.dump(self.model.num_timesteps)
+        self._axis.note()
         if self.verbose > 0:
             print(f"{level} epoch {epoch} ({phase}): mean objective {objective:.2f}, {record.seconds:.1f} s")
         if self.save_path is not None:
@@ -395,6 +423,7 @@ class ITSCallback(RouterCallback):
 
     def _save_checkpoint(self) -> None:
         """Write both levels' zips and the state of the strategy."""
+        self._axis.note()
         self._save_router()
         if self.save_path is not None:
             folder = self.save_path / CHECKPOINT_FOLDER

@@ -24,6 +24,7 @@ from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.freezing import Freezer
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.algorithms import resolve_algorithm
+from sb3_uav.reinforce.transfer import fine_tuning_settings, load
 from sb3_uav.training.episode_buffer import use_episode_buffer
 from sb3_uav.training.subsets import WholeInstances
 
@@ -41,11 +42,12 @@ class RouterTrainer:
     """
     Trains the router epoch by epoch.
 
-    :param settings: ``algo``, ``n_envs``, and the algorithm's own arguments, among them ``policy``
+    :param settings: ``algo``, ``n_envs``, and the algorithm's own arguments, among them ``policy`` unless there is a zip
     :param allocator: The allocator's algorithm, which gives the logger, and seed and device where the settings have none
     :param n_envs: Number of environments where the settings have none; at most ``epoch_size`` are made
     :param generator: Draws the instances of the fleet
     :param epoch_size: Instances of a router epoch
+    :param weights: Zip of a router to start from, with the settings for fine-tuning where there are no others
     :raises ValueError: If a setting is not allowed; the message names it
     """
 
@@ -56,6 +58,7 @@ class RouterTrainer:
         n_envs: int,
         generator: InstanceGenerator,
         epoch_size: int,
+        weights: Path | None = None,
     ) -> None:
         self.settings = settings
         self.epoch_size = epoch_size
@@ -66,7 +69,11 @@ class RouterTrainer:
         for name, reason in _REFUSED.items():
             if name in kwargs:
                 raise ValueError(f"router: {name} cannot be set: {reason}.")
-        if kwargs["policy"] in ("RouterPolicy", f"{RouterPolicy.__module__}.RouterPolicy", "sb3_uav.policies.RouterPolicy"):
+        if kwargs.get("policy") in (
+            "RouterPolicy",
+            f"{RouterPolicy.__module__}.RouterPolicy",
+            "sb3_uav.policies.RouterPolicy",
+        ):
             kwargs["policy"] = RouterPolicy
         if not isinstance(n_envs, int) or n_envs < 1:
             raise ValueError(f"router: n_envs is {n_envs!r}; it must be a whole number of at least 1.")
@@ -84,7 +91,7 @@ class RouterTrainer:
         kwargs.setdefault("device", allocator.device)
         try:
             with undisturbed_random_state():
-                self.algorithm: OnPolicyAlgorithm = algorithm(env=self.env, **kwargs)
+                self.algorithm: OnPolicyAlgorithm = self._make(algorithm, kwargs, weights)
         except TypeError as error:
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self.policy, RouterPolicy):
@@ -93,6 +100,14 @@ class RouterTrainer:
         outputs = [f for f in allocator.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(allocator.logger.dir) / "router") if outputs and allocator.logger.dir else None
         self.algorithm.set_logger(Logger(folder, [TensorBoardOutputFormat(folder)] if folder else []))
+
+    def _make(self, algorithm: type[OnPolicyAlgorithm], kwargs: dict[str, Any], weights: Path | None) -> OnPolicyAlgorithm:
+        if weights is None:
+            return algorithm(env=self.env, **kwargs)
+        policy = kwargs.pop("policy", RouterPolicy)
+        if policy is not RouterPolicy:
+            raise ValueError(f"router: policy is {policy!r}, but {weights} has its own; leave it out.")
+        return load(weights, self.env, algorithm, **{**fine_tuning_settings(algorithm, self.env), **kwargs})
 
     def _check_epoch(self, n_envs: int, instances_per_epoch: Any) -> None:
         if instances_per_epoch != self.epoch_size:

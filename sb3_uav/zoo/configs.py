@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 import sb3_uav
 from sb3_uav.common.sb3_compat import linear_schedule
+from sb3_uav.zoo.entries import find_entry
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
 
 # Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
@@ -64,7 +65,12 @@ def default_config(algo: str, env_id: str | None = None) -> Path | None:
     package = Path(sb3_uav.__file__).parent
     candidates = (folder / "zoo_configs" / f"{algo}.yml" for folder in (package, package.parent))
     ours = next((path for path in candidates if path.is_file()), None)
-    if ours is not None and env_id is not None and stock_config(algo).is_file() and env_id not in read_yaml(ours):
+    if (
+        ours is not None
+        and env_id is not None
+        and stock_config(algo).is_file()
+        and find_entry(read_yaml(ours), env_id) is None
+    ):
         return None
     return ours
 

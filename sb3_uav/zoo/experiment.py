@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from huggingface_sb3 import EnvironmentName
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
+from sb3_uav.zoo.entries import find_entry, scaled_values
+from sb3_uav.zoo.fine_tuning import Weights, find_checkpoint, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
-from sb3_uav.zoo.tuning import StopWhenDiverged, register_search_spaces
+from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
 # Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
 _SETUP_ERRORS = (
@@ -66,6 +72,7 @@ class UAVExperimentManager(ExperimentManager):
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
+        self._weights: Weights | None = None
         self._eval_env_kwargs_given = getattr(args, "eval_env_kwargs", None) is not None
         if kwargs.get("vec_env_type", "dummy") == "dummy":
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
@@ -77,15 +84,34 @@ class UAVExperimentManager(ExperimentManager):
         return f"{self.config}, {self.env_name.gym_id}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        entry = self.env_name.gym_id
         if str(self.config).endswith((".yml", ".yaml")):
-            read_yaml(Path(self.config))
-        hyperparams, saved = super().read_hyperparameters()
+            entry = find_entry(read_yaml(Path(self.config)), entry, self.env_kwargs) or entry
+        with self._reading(entry):
+            hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config}: the entry of {self.env_name.gym_id} needs at least n_timesteps and policy.")
         check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
         hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
         check_values(hyperparams, self._where)
+        scaled = scaled_values(hyperparams, entry, self.env_name.gym_id, self.env_kwargs)
+        for key, value in scaled.items():
+            if key not in (self.custom_hyperparams or {}):
+                print(f"{key} is for another number of tasks: {hyperparams[key]} becomes {value}")
+                hyperparams[key] = saved[key] = value
         return hyperparams, saved
+
+    @contextmanager
+    def _reading(self, entry: str) -> Iterator[None]:
+        """:param entry: What rl_zoo3 reads of the YAML in the ``with`` block; it looks for the entry of its environment"""
+        env_name = self.env_name
+        if entry != env_name.gym_id:
+            print(f"{self.config} has no entry for {env_name.gym_id}; using that of {entry}")
+        self.env_name = EnvironmentName(entry)
+        try:
+            yield
+        finally:
+            self.env_name = env_name
 
     def setup_experiment(self) -> Any:
         try:
@@ -112,6 +138,14 @@ class UAVExperimentManager(ExperimentManager):
 
     # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L443
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        if self.continue_training:
+            env = gym.spec(self.env_name.gym_id).make(**(hyperparams.get("env_kwargs") or self.env_kwargs or {}))
+            env_spaces = (env.observation_space, env.action_space)
+            env.close()
+            callbacks, algorithm = hyperparams.get("callback"), rl_zoo3.ALGOS[self.algo]
+            self._weights = weights_to_start_from(Path(self.trained_agent), algorithm, *env_spaces, callbacks)
+            if self._weights is not None:
+                hyperparams = start_from(self._weights, hyperparams)
         try:
             processed = super()._preprocess_hyperparams(hyperparams)
         except TypeError as error:
@@ -120,9 +154,23 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self._where}: policy_kwargs is {hyperparams['policy_kwargs']!r}; write a mapping.")
         if not self._eval_env_kwargs_given:
             self.eval_env_kwargs = self.env_kwargs
+        self._choose_info_keywords()
         if not self.eval_freq_given:
             self._choose_eval_freq(hyperparams, processed[2])
         return processed
+
+    def _choose_info_keywords(self) -> None:
+        """
+        Log in the monitor files what rl_zoo3 logs of robots: whether an episode was a success.
+
+        https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L697
+        """
+        given = self.monitor_kwargs.get("info_keywords")
+        if given is not None:
+            # Monitor joins it to a tuple.
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(given)}
+        elif has_success(self.env_name.gym_id) and not any("reward" in kw for kw in (self.env_kwargs, self.eval_env_kwargs)):
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": ("is_success",)}
 
     def _choose_eval_freq(self, hyperparams: dict[str, Any], callbacks: list[BaseCallback]) -> None:
         """
@@ -131,7 +179,7 @@ class UAVExperimentManager(ExperimentManager):
         :param hyperparams: Hyperparameters of the algorithm
         :param callbacks: Callbacks of the entry
         """
-        n_tasks = gym.spec(self.env_name.gym_id).kwargs.get("n_tasks")
+        n_tasks = {**gym.spec(self.env_name.gym_id).kwargs, **self.env_kwargs}.get("n_tasks")
         if any(isinstance(callback, FixedSetEvalCallback) for callback in callbacks):
             # It replaces rl_zoo3's EvalCallback, with more than a few random episodes.
             self.eval_freq = -1
@@ -148,11 +196,26 @@ class UAVExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
+        self.callbacks = [
+            PairCheckpointCallback.of(callback) if type(callback) is CheckpointCallback else callback
+            for callback in self.callbacks
+        ]
         for callback in self.callbacks:
             if isinstance(callback, ITSCallback):
                 callback.save_path = callback.save_path or Path(self.save_path)
-                if self.continue_training and callback.resume_from is None:
-                    callback.resume_from = _find_checkpoint(Path(self.trained_agent))
+                if self.continue_training and self._weights is None and callback.resume_from is None:
+                    callback.resume_from = find_checkpoint(Path(self.trained_agent))
+
+    # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L679
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self._weights is None:
+            return super()._load_pretrained_agent(hyperparams, env)
+        rewards = "" if self._weights.router is None else f" and the router {self._weights.router}"
+        print(f"Starting a new run with the weights of {self._weights.zip_file}{rewards}")
+        settings = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        settings |= dict(seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device)
+        algorithm: Any = rl_zoo3.ALGOS[self.algo]
+        return load(self._weights.zip_file, env, algorithm, **settings)
 
     def hyperparameters_optimization(self) -> None:
         given = self.specified_callbacks or []
@@ -198,17 +261,3 @@ def _is_fixed_set_evaluation(entry: Any) -> bool:
     """
     name = next(iter(entry)) if isinstance(entry, dict) else entry
     return str(name).rpartition(".")[2] == FixedSetEvalCallback.__name__
-
-
-def _find_checkpoint(trained_agent: Path) -> Path:
-    """
-    :param trained_agent: The allocator's zip to resume from
-    :return: The folder with the state of its interactive training
-    :raises FileNotFoundError: If there is none; the message names the zip to use if there is one near
-    """
-    beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
-    if (beside / STATE_FILE).is_file():
-        return beside
-    if (below / STATE_FILE).is_file():
-        return below
-    raise FileNotFoundError(f"-i {trained_agent}: neither {beside} nor {below} holds {STATE_FILE}, which names its router.")

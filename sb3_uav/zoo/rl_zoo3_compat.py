@@ -6,11 +6,17 @@ Overridden methods of its ``ExperimentManager`` are in :mod:`sb3_uav.zoo.experim
 
 from __future__ import annotations
 
+import argparse
+import runpy
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest import mock
 
 from sb3_uav.common.optional import install_command
 
@@ -18,6 +24,7 @@ try:
     import optuna  # noqa: F401  (rl_zoo3 imports it; a missing one is reported here too)
     import rl_zoo3
     import rl_zoo3.train
+    import rl_zoo3.utils
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 except ImportError as error:
@@ -57,6 +64,85 @@ def command_line(prog: str, arguments: Sequence[str]) -> Iterator[None]:
     """
     with _replaced(sys, "argv", [prog, *arguments]):
         yield
+
+
+@contextmanager
+def help_text(module: ModuleType | None, description: str, *more: tuple[str, str]) -> Iterator[None]:
+    """
+    Add a description to what a command of rl_zoo3 prints for ``--help``; its parser has none.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/train.py#L23
+
+    :param module: The module of the command; None for a script, which imports ``argparse`` when it runs
+    :param description: The text, printed as it is
+    :param more: Flags of ours, with the name of their value if they have one, and their explanations
+    """
+
+    class Parser(argparse.ArgumentParser):
+        def __init__(self, *_: Any, **kwargs: Any) -> None:
+            kwargs |= {"description": description, "formatter_class": argparse.RawDescriptionHelpFormatter}
+            super().__init__(**kwargs, usage="%(prog)s [options]")
+            for flag, text in more:
+                name, metavar = [*flag.split(" "), ""][:2]
+                kind: dict[str, Any] = {"metavar": metavar} if metavar else {"action": "store_true"}
+                self.add_argument(name, help=text, **kind)
+
+    # Not in argparse itself, whose class names itself.
+    stand_in = ModuleType("argparse")
+    vars(stand_in).update(vars(argparse), ArgumentParser=Parser)
+    with mock.patch.dict(sys.modules, argparse=stand_in) if module is None else _replaced(module, "argparse", stand_in):
+        yield
+
+
+def run_script(
+    module: str,
+    make_env: Callable[..., VecEnv] | None = None,
+    run_command: Callable[[Sequence[str]], int] | None = None,
+) -> None:
+    """
+    Run a module of rl_zoo3 that has no function to call, as ``python -m`` does.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/record_video.py
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/benchmark.py
+
+    :param module: Its name
+    :param make_env: Takes the place of ``rl_zoo3.utils.create_test_env``
+    :param run_command: Takes a command line in place of ``subprocess.call`` and returns an exit code
+    """
+    make = rl_zoo3.utils.create_test_env if make_env is None else make_env
+    call = subprocess.call if run_command is None else run_command
+    with _replaced(rl_zoo3.utils, "create_test_env", make), _replaced(subprocess, "call", call):
+        runpy.run_module(module, run_name="__main__")
+
+
+def plot_command(name: str) -> tuple[ModuleType, Callable[[], None]]:
+    """
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/plots/__init__.py
+
+    :param name: Name of a function of ``rl_zoo3.plots``
+    :return: Its module, which the package hides behind the function, and the function
+    """
+    module = import_module(f"rl_zoo3.plots.{name}")
+    return module, getattr(module, name)
+
+
+@contextmanager
+def shown_figures(show: bool) -> Iterator[list[Any]]:
+    """
+    Collect the figures that are open when pyplot should show them.
+
+    :param show: Whether it shows them all the same
+    :return: The figures, once the ``with`` block ends
+    """
+    import matplotlib.pyplot as plt
+
+    figures: list[Any] = []
+    before = set(plt.get_fignums())
+    with _replaced(plt, "show", plt.show if show else lambda *_, **__: None):
+        yield figures
+    for number in sorted(set(plt.get_fignums()) - before):
+        figures.append(plt.figure(number))
+        plt.close(number)
 
 
 @contextmanager

@@ -5,13 +5,25 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common.errors import main_function
+from sb3_uav.common.optional import require
+from sb3_uav.pretrained import names
+from sb3_uav.registration import ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
 
 _PROG = "sb3-uav train"
+_HELP = """\
+Train or tune with rl_zoo3 and the algorithms reinforce and ppo_mask beside its own.
+
+The defaults below are rl_zoo3's, but for these: --algo is reinforce; --conf-file is the YAML of sb3_uav for the algorithm,
+where it knows the environment; --eval-freq is once per epoch, or left to the YAML's FixedSetEvalCallback; --save-freq saves
+the router beside each checkpoint. --env is any TaskAllocation-U{V}-N{N}-v0 or RoutePlanning-N{N}-v0, TaskAllocation-v0 or
+RoutePlanning-v0 with --env-kwargs, or what --gym-packages registers.
+"""
 
 
 def train(arguments: Sequence[str]) -> None:
@@ -31,24 +43,47 @@ def train(arguments: Sequence[str]) -> None:
     parser.add_argument("-i", "--trained-agent")
     parser.add_argument("-tb", "--tensorboard-log")
     parser.add_argument("-P", "--progress", action="store_true")
+    parser.add_argument("--track", action="store_true")
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--trust", action="store_true")
+    parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
+    arguments = [argument for argument in arguments if argument != "--trust"]
     require_zoo("Training from YAML")
     if known.progress:
         require_zoo("The progress bar", "tqdm.rich", "rich")
-    if known.tensorboard_log:
-        require_zoo("--tensorboard-log", "tensorboard")
+    if known.tensorboard_log or known.track:
+        require_zoo("--track" if known.track else "--tensorboard-log", "tensorboard")
+    if known.track:
+        require("wandb", "--track", "track")
     from sb3_uav.zoo.configs import default_config
     from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
-    from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, rl_zoo3
+    from sb3_uav.zoo.fine_tuning import zip_of_pair
+    from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, help_text, rl_zoo3
+    from sb3_uav.zoo.trust import TRUST_FLAG, require_trust
 
     register_algorithms()
-    if known.trained_agent is not None and not Path(known.trained_agent).is_file():
-        raise FileNotFoundError(f"-i {known.trained_agent}: no such file; give the zip of a trained agent.")
+    if known.help:
+        with command_line(_PROG, ["--help"]), help_text(rl_zoo3.train, _HELP, TRUST_FLAG):
+            rl_zoo3.train.train()
+    for module in known.gym_packages:
+        import_module(module)
+    if known.env is not None:
+        ensure_registered(known.env)
+    shipped = None if known.trained_agent is None else zip_of_pair(known.trained_agent, known.env)
+    if known.trained_agent is not None and shipped is None and not Path(known.trained_agent).is_file():
+        raise FileNotFoundError(
+            f"-i {known.trained_agent}: no such file; give the zip of a trained agent, or one of {names()}."
+        )
+    if known.trained_agent is not None and shipped is None:
+        require_trust(Path(known.trained_agent).parent, known.trust)
+    # The last one counts.
+    agent = [] if shipped is None else ["-i", str(shipped)]
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
-    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments]):
+    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments, *agent]):
         try:
             rl_zoo3.train.train()
         except AssertionError as error:
@@ -58,6 +93,11 @@ def train(arguments: Sequence[str]) -> None:
             raise
         except OSError as error:
             raise OSError(f"could not write: {error}. Earlier files are intact.") from error
+        except Exception as error:
+            # wandb is not imported here, so that its classes cannot be named.
+            if type(error).__module__.partition(".")[0] != "wandb":
+                raise
+            raise ValueError(f"--track: {error} Or set WANDB_MODE=offline.") from error
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.

@@ -161,18 +161,27 @@ def register_search_spaces(env_id: str) -> None:
 
     :param env_id: Id of a registered environment
     """
-    for algo, (sampler, converter) in (_OUR_SPACES if _is_ours(env_id) else _OTHER_SPACES).items():
+    for algo, (sampler, converter) in (_OUR_SPACES if problem_env_class(env_id) else _OTHER_SPACES).items():
         set_search_space(algo, sampler, converter)
 
 
-def _is_ours(env_id: str) -> bool:
+def problem_env_class(env_id: str) -> type[ProblemEnv] | None:
     """
     :param env_id: Id of a registered environment
-    :return: Whether it is one of this package, or a user's subclass of one
+    :return: Its class, if that is one of this package, or a user's subclass of one
     """
     entry_point = gym.spec(env_id).entry_point
     creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    return isinstance(creator, type) and issubclass(creator, ProblemEnv)
+    return creator if isinstance(creator, type) and issubclass(creator, ProblemEnv) else None
+
+
+def has_success(env_id: str) -> bool:
+    """
+    :param env_id: Id of a registered environment
+    :return: Whether the last ``info`` of its episodes holds ``is_success``, unless it is made with a reward of the user
+    """
+    found = problem_env_class(env_id)
+    return found is not None and found.step is ProblemEnv.step
 
 
 class StopWhenDiverged(BaseCallback):

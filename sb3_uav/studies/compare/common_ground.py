@@ -14,6 +14,7 @@ from sb3_uav.envs import Instances
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
+from sb3_uav.registration import ensure_registered
 from sb3_uav.studies.compare.fixed_router import pretrain_router
 from sb3_uav.studies.compare.settings import Settings
 from sb3_uav.studies.compare.variants import router_settings
@@ -28,11 +29,9 @@ def make_problem(env_id: str) -> Any:
     """
     :param env_id: Id of an environment
     :return: The problem behind it
-    :raises ValueError: If it is not one of ours
+    :raises ValueError: If there is none, or it is not one of ours
     """
-    if env_id not in gym.registry:
-        near = [name for name in gym.registry if name.startswith(env_id.split("-")[0])]
-        raise ValueError(f"--env {env_id}: there is no such environment; those of sb3_uav of this kind are {near}.")
+    ensure_registered(env_id)
     environment = gym.make(env_id).unwrapped
     if not isinstance(environment, ProblemEnv):
         raise ValueError(f"--env {env_id}: is not an environment of sb3_uav.")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_uav.zoo.configs import default_config, plain_numbers, read_yaml
+from sb3_uav.zoo.entries import find_entry, scaled_values
 
 # Samples per instance of the variant with the shared baseline, if the YAML uses another one.
 _SHARED_SAMPLES = 8
@@ -45,9 +46,11 @@ def _read_entry(algo: str, env_id: str, conf_file: str | None = None) -> dict[st
     if path is None or not path.is_file():
         raise ValueError(f"algo {algo!r}: there is no YAML {path or f'zoo_configs/{algo}.yml'}; name one as conf_file.")
     entries = read_yaml(path)
-    if not isinstance(entries.get(env_id), dict):
+    name = find_entry(entries, env_id)
+    if name is None or not isinstance(entries.get(name), dict):
         raise ValueError(f"{path}: has no entry for {env_id}; add one, or compare on another environment.")
-    return plain_numbers(entries[env_id])
+    entry: dict[str, Any] = plain_numbers(entries[name])
+    return {**entry, **scaled_values(entry, name, env_id)}
 
 
 def _default_variants(env_id: str) -> dict[str, dict[str, Any]]:
