@@ -206,7 +206,7 @@ def test_fig3(out: Path) -> None:
 @pytest.mark.parametrize(
     "name, trainings, log",
     [
-        ("fig4", ["mixture"], "models/mixture/ITS"),
+        ("fig4", ["mixture", *(scenario.name for scenario in scenarios())], "models/mixture/ITS"),
         ("fig5", ["ITS", "ITS/pre-training", "ITS/intensive", "ITS/pre-training&intensive"], "ablation/U4-N80/ITS/seed1"),
     ],
 )
@@ -219,13 +219,18 @@ def test_curves_of_every_epoch(name: str, trainings: list[str], log: str, out: P
         for seed in seeds:
             of_seed = [row for row in rows if (row["Training"], row.get("Seed")) == (training, seed)]
             upper = [row for row in of_seed if row["Level"] == "Upper level"]
-            assert [int(row["Epoch"]) for row in upper] == [1, 2, 3, 4]
+            # The evaluations of the situations begin before the first epoch.
+            assert [int(row["Epoch"]) for row in upper] == [0, 1, 2, 3, 4][upper[0]["Phase"] != "evaluation" :]
             assert all(float(row["Cost"]) <= 0 for row in upper) and float(upper[-1]["Minutes"]) > 0
     with (out / log / "its_log.csv").open() as file:
         logged = [-float(row["objective"]) for row in csv.DictReader(file) if row["level"] == "allocator"]
     mine = [r for r in rows if (r["Training"], r.get("Seed")) == (trainings[0], seeds[-1])]
     drawn = [float(row["Cost"]) for row in mine if row["Level"] == "Upper level"]
     assert drawn == pytest.approx(logged, abs=1e-4)
+    if name == "fig4":
+        with (out / log / "size_grid.csv").open() as file:
+            evaluated = [-float(row["U6-N20"]) for row in csv.DictReader(file)]
+        assert [float(row["Cost"]) for row in rows if row["Training"] == "U6-200"] == pytest.approx(evaluated, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -126,16 +126,19 @@ def test_training_entries() -> None:
     assert (its["n_epochs"], its["n_intensive_epochs"], its["n_continuous_epochs"]) == (100, 12, 6)
     assert entry["n_timesteps"] >= 100 * 1_280_000 * 300
     assert len(entry["callback"]) == 2
-    # At the others those of two cores; no table needs the evaluations during the training.
+    # At the others those of two cores; Fig. 4 needs evaluations of a pair for all situations during its training.
     cpu = training_entry(_CPU, _CPU.recipe, MIXTURE, INDEPENDENT)
     its = cpu["callback"][0]["sb3_uav.training.ITSCallback"]
-    assert (cpu["env_kwargs"], cpu["baseline"], len(cpu["callback"])) == ({"n_tasks": 500, "max_distance": 2.0}, "shared", 1)
+    assert (cpu["env_kwargs"], cpu["baseline"], len(cpu["callback"])) == ({"n_tasks": 500, "max_distance": 2.0}, "shared", 2)
+    evaluation = cpu["callback"][1]["sb3_uav.training.FixedSetEvalCallback"]
+    assert [6, 300, 8] in evaluation["sizes"] and len(evaluation["sizes"]) == 12 and evaluation["n_samples"] == 0
     assert (its["strategy"], its["n_pretraining_epochs"], its["router"]["lr_decay"]) == ("independent", 0, 0.9)
     assert "preset" not in cpu["policy_kwargs"] and its["warm_start"]["n_updates"] > 0
     assert _CPU.ablation is not None
     ablation = training_entry(_CPU, _CPU.ablation, Scenario(4, 80), NO_INTENSIVE)
     its = ablation["callback"][0]["sb3_uav.training.ITSCallback"]
     assert (its["warm_start"], its["n_pretraining_epochs"], its["strategy"]) == (None, 5, "no-intensive")
+    assert len(ablation["callback"]) == 1
     assert training_entry(_SMOKE, _SMOKE.recipe, Scenario(4, 80), ITS)["env_kwargs"] == {"n_tasks": 8, "max_distance": 1.0}
 
 

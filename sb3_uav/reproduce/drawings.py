@@ -41,11 +41,13 @@ class _Curve(NamedTuple):
     :param cost: ``(n_epochs,)``, minus the mean objective of the training episodes
     :param minutes: ``(n_epochs,)``, time since the beginning of the training
     :param n_pretraining: Number of epochs of pre-training
+    :param epochs: ``(n_epochs,)``, their numbers
     """
 
     cost: np.ndarray
     minutes: np.ndarray
     n_pretraining: int
+    epochs: np.ndarray
 
 
 def _draw_schedules(table: Table) -> Any:
@@ -86,7 +88,7 @@ def _read_curves(table: Table) -> dict[str, dict[str, _Curve]]:
         rows = [row for row in table.rows if row[:2] == [training, level]]
         cost, minutes = (np.array([float(row[column]) for row in rows]) for column in (4, 5))
         n_pretraining = sum(row[3] == "pre-training" for row in rows)
-        curves.setdefault(training, {})[level] = _Curve(cost, minutes, n_pretraining)
+        curves.setdefault(training, {})[level] = _Curve(cost, minutes, n_pretraining, np.array([int(row[2]) for row in rows]))
     return curves
 
 
@@ -98,19 +100,21 @@ def _draw_learning_curves(table: Table) -> Any:
     :return: A matplotlib figure
     """
     curves = _read_curves(table)
-    # One training may be for all situations.
+    # One training may be for all situations, of which there are evaluations of both levels together.
     fleets = sorted({name.partition("-")[0] for name in curves})
     figure = new_figure(5.5 * max(len(fleets), 2), 7.0)
     colors = defaultdict(lambda: SERIES_COLORS[0], zip(map(str, SIZES), _shades(len(SIZES)), strict=True))
     grid = figure.subplots(2, len(fleets), squeeze=False)
     for line, level in zip(grid, (UPPER_LEVEL, LOWER_LEVEL), strict=True):
         for axes, fleet in zip(line, fleets, strict=True):
-            style_axes(axes, f"{fleet}: {level.lower()}", "epoch", "cost")
             mine = {name: levels[level] for name, levels in curves.items() if name.startswith(fleet) and level in levels}
+            if not mine:
+                axes.set_axis_off()
+                continue
+            style_axes(axes, f"{fleet}: {level.lower()}", "epoch", "cost")
             for name, curve in mine.items():
-                epochs = np.arange(1, len(curve.cost) + 1)
                 look = {"color": colors[name.partition("-")[2]], "label": name}
-                axes.plot(epochs, curve.cost, linewidth=1.5, **look, **_markers(len(epochs), 0))
+                axes.plot(curve.epochs, curve.cost, linewidth=1.5, **look, **_markers(len(curve.epochs), 0))
             n_pretraining = max((curve.n_pretraining for curve in mine.values()), default=0)
             if n_pretraining > 0:
                 axes.axvline(n_pretraining + 0.5, color="0.4", linestyle=":", linewidth=1.2)

@@ -14,7 +14,7 @@ from sb3_uav.reproduce.blocks import Block, make_solvers
 from sb3_uav.reproduce.drawings import CURVE_COLUMNS, DEPOT, LOWER_LEVEL, SCHEDULE_COLUMNS, UPPER_LEVEL, is_pair
 from sb3_uav.reproduce.evaluator import complete
 from sb3_uav.reproduce.methods import DL_DRL, DL_DRL_I, DL_DRL_SHORT, UNTRAINED_PAIR, column, explanations, learned_pairs
-from sb3_uav.reproduce.pairs import LEVELS, read_log
+from sb3_uav.reproduce.pairs import LEVELS, Model, read_log
 from sb3_uav.reproduce.paper import (
     ABLATION_FLEET,
     ABLATION_SIZE,
@@ -25,9 +25,10 @@ from sb3_uav.reproduce.paper import (
     SIZES,
     STRATEGY_TITLES,
 )
-from sb3_uav.reproduce.scales import Scenario, scenarios
+from sb3_uav.reproduce.scales import Scale, Scenario, scenarios
 from sb3_uav.reproduce.session import Notes, Session
 from sb3_uav.reproduce.table_formats import MISSING, Column, Table, number
+from sb3_uav.training.instance_sets import SizeTable
 from sb3_uav.training.its_schedule import ITS
 
 _LEVEL_TITLES = {"allocator": UPPER_LEVEL, "router": LOWER_LEVEL}
@@ -41,12 +42,14 @@ class LoggedCurve(NamedTuple):
     :param phase: Phase of each epoch
     :param minutes: ``(n_epochs,)``, CPU time since the beginning of the training, of both levels; wall time in old logs
     :param generation_minutes: Time spent generating the router's instances
+    :param first_epoch: Number of the first of these epochs
     """
 
     cost: np.ndarray
     phase: list[str]
     minutes: np.ndarray
     generation_minutes: float
+    first_epoch: int = 1
 
 
 def read_logged_curves(its_log: Path) -> dict[str, LoggedCurve]:
@@ -135,9 +138,12 @@ def fig4(session: Session) -> list[Path]:
     notes = Notes("Cost: minus the mean number of tasks completed in the training episodes (lower level: by one UAV).")
     if session.scale.universal:
         notes.add(
-            "One training for all sizes and fleets, in place of the paper's twelve. Its batches have random sizes, with which "
-            "the cost of an epoch varies."
+            "One training for all sizes and fleets, in place of the paper's twelve. mixture: its training episodes, of random "
+            "sizes, with which the cost varies. The situations: both levels before the first epoch (0, after the warm start) "
+            f"and after each one, greedy, on {session.scale.recipe.evaluations} fixed instances of each."
         )
+        for model in models.values():
+            curves |= _read_evaluations(model, session.scale)
     else:
         notes.add("Until the dotted line, the lower level is pre-trained on whole instances.")
     notes.add_stand_ins(session.scale, [])
@@ -155,13 +161,29 @@ def fig4(session: Session) -> list[Path]:
     return session.write(table, "fig4", _curves_table("Fig. 4", {s.name: c for s, c in curves.items()}, table.notes))
 
 
+def _read_evaluations(model: Model, scale: Scale) -> dict[Scenario, dict[str, LoggedCurve]]:
+    """
+    :param model: A pair for all situations
+    :param scale: The scale
+    :return: The curves of its evaluations by situation; none if there were no evaluations
+    :raises ValueError: If their file is damaged
+    """
+    if model.size_table is None:
+        return {}
+    names = {scenario: f"U{scenario.n_uavs}-N{scale.n_tasks(scenario)}" for scenario in scenarios()}
+    rows = SizeTable.load(model.size_table, list(names.values())).rows
+    phase, minutes = ["evaluation"] * len(rows), np.array([row["seconds"] / 60 for row in rows])
+    costs = {scenario: np.array([-row[name] for row in rows]) for scenario, name in names.items()}
+    return {scenario: {"allocator": LoggedCurve(cost, phase, minutes, 0.0, 0)} for scenario, cost in costs.items()}
+
+
 def _curves_table(label: str, curves: Mapping[str, Mapping[str, LoggedCurve]], notes: Sequence[str]) -> Table:
     table = Table(label, "every epoch", [Column(title) for title in CURVE_COLUMNS], notes=list(notes))
     for name, levels in curves.items():
         for level, curve in levels.items():
             for index, phase in enumerate(curve.phase):
                 figures = f"{curve.cost[index]:.4f}", f"{curve.minutes[index]:.4f}"
-                table.add([name, _LEVEL_TITLES[level], str(index + 1), phase, *figures])
+                table.add([name, _LEVEL_TITLES[level], str(curve.first_epoch + index), phase, *figures])
     return table
 
 

@@ -16,13 +16,15 @@ import yaml
 
 from sb3_uav.common.files import replaced_when_complete
 from sb3_uav.evaluation.provenance import describe_machine
-from sb3_uav.reproduce.scales import Recipe, Scale, Scenario
+from sb3_uav.reproduce.scales import Recipe, Scale, Scenario, scenarios
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
 
 ALLOCATOR_FILE, ROUTER_FILE, ITS_LOG = "allocator.zip", "router.zip", "its_log.csv"
+# Of FixedSetEvalCallback: means of the evaluations by situation.
+SIZE_TABLE = "size_grid.csv"
 _TRAINING_FILE = "training.json"
 _CONFIG_FILE, _OUTPUT_FILE = "config.yml", "output.txt"
-ITS_KEY = "sb3_uav.training.ITSCallback"
+ITS_KEY, _EVALUATION_KEY = "sb3_uav.training.ITSCallback", "sb3_uav.training.FixedSetEvalCallback"
 
 
 class TrainingError(ValueError):
@@ -101,8 +103,12 @@ def training_entry(scale: Scale, recipe: Recipe, scenario: Scenario, strategy: s
     its = entry["callback"][0][ITS_KEY]
     its |= {**recipe.its, "strategy": strategy, "verbose": 1}
     its["router"] |= recipe.router
-    if not recipe.evaluations:
+    if recipe.evaluations is not None:
         del entry["callback"][1:]
+    if recipe.evaluations:
+        sets = [[each.n_uavs, scale.n_tasks(each), recipe.evaluations] for each in scenarios()]
+        evaluation = {"sizes": sets, "n_samples": 0, "max_distance": scale.max_distance}
+        entry["callback"].append({_EVALUATION_KEY: evaluation})
     if scenario.n_tasks in recipe.instances_per_epoch:
         entry["instances_per_epoch"] = recipe.instances_per_epoch[scenario.n_tasks]
     sizes = {"n_tasks": scale.n_tasks(scenario), "max_distance": scale.max_distance}
@@ -185,6 +191,8 @@ def _publish(job: PairTraining, run: Path, state: Mapping[str, Any]) -> None:
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["allocator"], temporary / ALLOCATOR_FILE)
     shutil.copyfile(run / CHECKPOINT_FOLDER / state["router"], temporary / ROUTER_FILE)
     shutil.copyfile(run / LOG_FILE, temporary / ITS_LOG)
+    if (run / SIZE_TABLE).is_file():
+        shutil.copyfile(run / SIZE_TABLE, temporary / SIZE_TABLE)
     n_router_epochs = job.schedule.n_router_epochs
     about = {
         "seed": job.seed,

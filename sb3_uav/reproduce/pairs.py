@@ -13,6 +13,7 @@ from sb3_uav.reproduce.pair_training import (
     ALLOCATOR_FILE,
     ITS_LOG,
     ROUTER_FILE,
+    SIZE_TABLE,
     PairTraining,
     check_complete,
     training_entry,
@@ -65,6 +66,12 @@ class Model:
     def its_log(self) -> Path | None:
         """The log of its training, if there is one."""
         path = self.folder / ITS_LOG
+        return path if path.is_file() else None
+
+    @property
+    def size_table(self) -> Path | None:
+        """The evaluations in the course of its training, if there were any."""
+        path = self.folder / SIZE_TABLE
         return path if path.is_file() else None
 
 

@@ -53,7 +53,8 @@ class Recipe:
     :param its: Changes to the interactive training strategy
     :param instances_per_epoch: Instances per epoch by the paper's number of tasks; that of the entry where missing
     :param config: Which of the zoo's YAML files the entry comes from
-    :param evaluations: Whether to keep the entry's evaluations during the training; no table or figure needs them
+    :param evaluations: Instances of every situation that the pair solves greedily after each epoch, for Fig. 4 of a training
+        for all situations; no evaluations when 0, those of the entry when None
     """
 
     allocator: Mapping[str, Any] = field(default_factory=dict)
@@ -61,7 +62,7 @@ class Recipe:
     its: Mapping[str, Any] = field(default_factory=dict)
     instances_per_epoch: Mapping[int, int] = field(default_factory=dict)
     config: str = "paper"
-    evaluations: bool = True
+    evaluations: int | None = None
 
 
 @dataclass(frozen=True)
@@ -135,14 +136,15 @@ def scenarios(sizes: tuple[int, ...] = SIZES) -> list[Scenario]:
 _TINY = {"embed_dim": 16, "n_layers": 1, "n_heads": 2, "ff_dim": 16, "use_values": False}
 
 
-def _tiny_recipe(**its: Any) -> Recipe:
+def _tiny_recipe(evaluations: int, **its: Any) -> Recipe:
     """
+    :param evaluations: As in :class:`Recipe`
     :param its: Changes to the interactive training strategy
     :return: A training of a second
     """
     settings = {"policy_kwargs": _TINY, "n_envs": 8, "n_samples": 4}
     its |= {"n_epochs": 4, "router_instances_per_epoch": 64, "n_intensive_epochs": 2, "n_continuous_epochs": 2}
-    return Recipe({**settings, "instances_per_epoch": 16}, settings, its, config="reinforce", evaluations=False)
+    return Recipe({**settings, "instances_per_epoch": 16}, settings, its, config="reinforce", evaluations=evaluations)
 
 
 def _timing_recipe(n_envs: int, n_instances: int, **settings: Any) -> Recipe:
@@ -154,7 +156,7 @@ def _timing_recipe(n_envs: int, n_instances: int, **settings: Any) -> Recipe:
     """
     settings = {"n_envs": n_envs, "baseline_kwargs": {"n_test_instances": n_envs}, **settings}
     its = {"n_epochs": 2, "n_pretraining_epochs": 0, "n_intensive_epochs": 0}
-    return Recipe(settings, settings, its, dict.fromkeys(SIZES, n_instances), evaluations=False)
+    return Recipe(settings, settings, its, dict.fromkeys(SIZES, n_instances), evaluations=0)
 
 
 _SMOKE = Scale(
@@ -165,9 +167,9 @@ _SMOKE = Scale(
     max_distance=1.0,
     universal=True,
     trained_sizes=(80, 200),
-    recipe=_tiny_recipe(warm_start={"n_subsets": 32, "n_updates": 2}, n_pretraining_epochs=0),
+    recipe=_tiny_recipe(4, warm_start={"n_subsets": 32, "n_updates": 2}, n_pretraining_epochs=0),
     # The recipe of cpu has no warm start in Fig. 5 either.
-    ablation=_tiny_recipe(warm_start=None, n_pretraining_epochs=1),
+    ablation=_tiny_recipe(0, warm_start=None, n_pretraining_epochs=1),
     n_ablation_seeds=2,
     timing=_timing_recipe(8, 16, policy_kwargs={**_TINY, "preset": "paper"}),
     n_instances=dict.fromkeys((*SIZES, *LARGER_SIZES), 2),
@@ -185,7 +187,7 @@ _CPU = Scale(
     universal=True,
     recipe=Recipe(
         config="reinforce",
-        evaluations=False,
+        evaluations=8,
         allocator={"lr_decay": 0.9, "instances_per_epoch": 256},
         router={"lr_decay": 0.9},
         its={
@@ -196,7 +198,7 @@ _CPU = Scale(
     # Without a warm start, which would be a pre-training of another kind in all of them.
     ablation=Recipe(
         config="reinforce",
-        evaluations=False,
+        evaluations=0,
         allocator={"instances_per_epoch": 192},
         its={
             **{"n_epochs": 16, "n_pretraining_epochs": 5, "n_intensive_epochs": 8, "n_continuous_epochs": 4},
@@ -206,8 +208,8 @@ _CPU = Scale(
     n_ablation_seeds=3,
     timing=_timing_recipe(32, 64),
     n_instances={
-        **{80: 40, 100: 40, 150: 24, 200: 24, 300: 16, 500: 12},
-        **{600: 6, 700: 6, 800: 6, 900: 6, 1000: 6, 1500: 2},
+        **{80: 32, 100: 32, 150: 24, 200: 16, 300: 12, 500: 10},
+        **{600: 4, 700: 4, 800: 4, 900: 4, 1000: 4, 1500: 2},
     },
     n_exact_instances=3,
     exact_sizes=(80, 100, 150),
