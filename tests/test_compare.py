@@ -27,7 +27,6 @@ from sb3_uav.training.fixed_set_history import EvaluationHistory, FixedSetResult
 pytest.importorskip("rl_zoo3")
 from sb3_uav.cli import main as cli
 from sb3_uav.cli.compare import _make_parser
-from sb3_uav.common.statistics import confidence_halfwidth
 from sb3_uav.studies.compare.common_ground import make_validation_set
 from sb3_uav.studies.compare.fixed_router import _DividedSubsets, pretrain_router
 from sb3_uav.studies.compare.report import Run, _compute_band, _compute_table, _csv_text, _difference, _estimate, _interpolate
@@ -99,13 +98,6 @@ def test_interval_of_a_difference(shared, expected):
     assert found.mean == pytest.approx(first.mean() - second.mean())
     assert found.half_width == pytest.approx(expected, rel=0.25)
     assert np.isnan(_difference(first[:1], second).half_width)
-
-
-def test_student_intervals_agree_with_tables():
-    """Quantiles 2.262 (9 degrees of freedom), 2.228 (10) and 2.042 (30)."""
-    for n, quantile in ((10, 2.262), (11, 2.228), (31, 2.042)):
-        values = np.arange(float(n))
-        assert confidence_halfwidth(values) == pytest.approx(quantile * values.std(ddof=1) / n**0.5, rel=1e-3)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=8), st.floats(-1.0, 9.0))
