@@ -1,14 +1,12 @@
-"""Names of on-policy algorithms, and objects by their dotted path."""
+"""Names of on-policy algorithms."""
 
 from __future__ import annotations
-
-from importlib import import_module
-from typing import Any
 
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_uav.common.import_name import import_object
 from sb3_uav.reinforce import REINFORCE
 
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
@@ -17,19 +15,6 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
     "ppo_mask": MaskablePPO,
     "a2c": A2C,
 }
-
-
-def import_object(path: str) -> Any:
-    """
-    :param path: ``package.module.name``
-    :return: The object
-    :raises ValueError: If there is none
-    """
-    module_name, _, name = path.rpartition(".")
-    try:
-        return getattr(import_module(module_name), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(str(error)) from error
 
 
 def resolve_algorithm(name: str) -> type[OnPolicyAlgorithm]:

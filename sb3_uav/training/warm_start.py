@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sb3_uav.reinforce.algorithms import import_object
+from sb3_uav.common.import_name import import_object
 
 _IMITATION_PATH = "sb3_uav.training.imitation.imitate"
 # The end of that path in every version; YAML files of 0.1.0 name another package.
