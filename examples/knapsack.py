@@ -1,8 +1,4 @@
-"""
-A masked attention policy for an environment of one's own, here the knapsack problem: which items to pack, for the most value?
-
-Nodes are the items, encoded once per episode; the context is the room that is left. Trained with our REINFORCE.
-"""
+"""Masked attention for an environment of one's own: a knapsack, whose items are encoded once per episode, by REINFORCE."""
 
 import argparse
 from typing import Any
@@ -17,8 +13,8 @@ N_ITEMS, CAPACITY = 15, 3.0
 
 
 class KnapsackEnv(gym.Env[Any, Any]):
-    nodes, room_left = gym.spaces.Box(0, 1, (N_ITEMS, 2), np.float32), gym.spaces.Box(0, 1, (1,), np.float32)
-    observation_space = gym.spaces.Dict(nodes=nodes, context=room_left, action_mask=gym.spaces.MultiBinary(N_ITEMS))
+    nodes, context = gym.spaces.Box(0, 1, (N_ITEMS, 2), np.float32), gym.spaces.Box(0, 1, (1,), np.float32)
+    observation_space = gym.spaces.Dict(nodes=nodes, context=context, action_mask=gym.spaces.MultiBinary(N_ITEMS))
     action_space = gym.spaces.Discrete(N_ITEMS)
 
     def reset(self, *, seed=None, options=None):
@@ -49,9 +45,9 @@ def play(choose, n_episodes=500):
     return value / n_episodes, n_illegal
 
 
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--timesteps", type=int, default=25_000, help="default: %(default)s")
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--timesteps", type=int, default=25_000, help="default: %(default)s")
     settings: dict[str, Any] = dict(n_steps=16, baseline="critic", normalize_advantage=True, learning_rate=3e-3, seed=0)
     network = dict(embed_dim=32, n_layers=1, n_heads=4, ff_dim=64)
     model = REINFORCE("MaskedAttentionPolicy", make_vec_env(KnapsackEnv, 32, 10_000), policy_kwargs=network, **settings)

@@ -124,3 +124,21 @@ def test_own_coordinates(tmp_path):
         assert points and all((x < 1200) == (uav == 1) for x, _ in points)
         n_stops += len(points)
     assert f"{n_stops} of 15 tasks visited" in printed
+
+
+@pytest.mark.slow
+def test_knapsack(tmp_path):
+    chance, greedy, learned, illegal = numbers(
+        rf"Value packed: {NUMBER} at random, {NUMBER} by value per weight, {NUMBER} learned; illegal: (\d+)",
+        run("knapsack", tmp_path, "--timesteps", "10000"),
+    )
+    assert chance < 4 < 4.8 < learned and 5 < greedy and illegal == 0
+
+
+@pytest.mark.slow
+def test_tsp(tmp_path):
+    chance, greedy, learned, illegal = numbers(
+        rf"Tour length: {NUMBER} at random, {NUMBER} to the nearest, {NUMBER} learned; illegal: (\d+)",
+        run("tsp", tmp_path, "--timesteps", "10000"),
+    )
+    assert learned < 3.8 < 5 < chance and 3 < greedy < 3.4 and illegal == 0
