@@ -70,7 +70,7 @@ class ExportablePolicy(nn.Module):
         """
         inputs = []
         for space in self._spaces.values():
-            shape, dtype = (batch_size, *(space.shape or ())), th.from_numpy(space.sample()).dtype
+            shape, dtype = (batch_size, *(space.shape or ())), th.as_tensor(space.sample()).dtype
             inputs.append(th.ones(shape, dtype=dtype, device=self.policy.device))
         return tuple(inputs)
 

@@ -58,6 +58,11 @@ def load_policy(
     file = _existing_file(Path(path))
     data, parameters = _read_zip(file)
     policy_class = next((cls for key, cls in _SIGNATURES.items() if key in parameters), None)
+    if "features_extractor.encoder.embed_node.weight" in parameters:
+        raise ValueError(
+            f"{file}: holds a MaskedAttentionPolicy, whose spaces are stored as a pickle, which is not executed here; if you "
+            "trust the file, load it with the algorithm's own load() and use model.policy."
+        )
     if policy_class is None:
         raise ValueError(
             f"{file}: holds the policy of another kind (its first parameter is {next(iter(parameters), 'missing')!r}); "
@@ -73,6 +78,7 @@ def load_policy(
             found = parameter[~th.isfinite(parameter)].flatten()[0].item()
             raise ValueError(f"{file}: parameter '{name}' holds {found}; the training diverged, use an earlier checkpoint.")
     policy_kwargs = _plain_policy_kwargs(data, file)
+    _check_stock_code(data, policy_kwargs, file)
     try:
         policy = policy_class.from_parameters(parameters, policy_kwargs, "cpu")
     except (ValueError, TypeError, AssertionError, RuntimeError) as error:
@@ -157,3 +163,21 @@ def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
                 "load it with the algorithm's own load() and use model.policy."
             )
     return policy_kwargs
+
+
+def _check_stock_code(data: dict[str, Any], policy_kwargs: dict[str, Any], file: Path) -> None:
+    """
+    :param data: The JSON of an SB3 zip
+    :param policy_kwargs: The arguments of its policy
+    :param file: The zip, named in errors
+    :raises ValueError: If the policy or its extractor is a class of a user, which acts otherwise and is not imported here
+    """
+    stored = data.get("policy_class")
+    module = stored.get("__module__") if isinstance(stored, dict) else None
+    extractor = policy_kwargs.get("features_extractor_class")
+    for what, found in (("policy is a class of the module", module), ("features_extractor_class is", extractor)):
+        if found is not None and str(found).partition(".")[0] not in ("sb3_uav", "stable_baselines3", "sb3_contrib"):
+            raise ValueError(
+                f"{file}: its {what} {found!r}, which is not imported here; if you trust the file, load it with the "
+                "algorithm's own load() and use model.policy."
+            )
