@@ -1,10 +1,18 @@
-"""Small environments that know nothing of this package, with masks."""
+"""Small environments that know nothing of this package, with masks, and models for them."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_uav.policies import MaskedAttentionPolicy
+from sb3_uav.reinforce import REINFORCE
 
 SMALL: dict[str, Any] = dict(embed_dim=16, n_layers=1, n_heads=2, ff_dim=16)
 
@@ -17,7 +25,7 @@ class PickEnv(gym.Env[Any, Any]):
     :param n_real: Number of real nodes; without a padding mask when None
     :param n_others: Number of actions beside the nodes, all of which end the episode
     :param changing: Whether the nodes hold a flag of what has been picked
-    :param directions: Number of actions where no action is a node: they step through the nodes; None elsewhere
+    :param n_actions: Number of actions where none is for a node: each pays the feature of one; None elsewhere
     :param names: Names of the keys
     :param flat: Whether the node set is flat
     """
@@ -76,7 +84,7 @@ class PickEnv(gym.Env[Any, Any]):
             if action < self.n_nodes:
                 reward, self.picked[action] = float(self.nodes[action, 0]) - 0.5, True
             done = action >= self.n_nodes or not (self.real & ~self.picked).any()
-        return self.observe(), reward, done, False, {"illegal": self.n_illegal}
+        return self.observe(), reward, bool(done), False, {"illegal": self.n_illegal}
 
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -87,3 +95,29 @@ KINDS: dict[str, dict[str, Any]] = {
     "head": dict(n_actions=3),
     "flat": dict(flat=True, n_real=6, n_others=1),
 }
+
+CPU = th.device("cpu")
+ALGORITHMS: dict[str, Any] = {"ppo": PPO, "a2c": A2C, "ppo_mask": MaskablePPO, "reinforce": REINFORCE}
+POLICY: Any = MaskedAttentionPolicy
+
+
+def make_env(n_envs: int = 4, **kwargs: Any) -> Any:
+    return make_vec_env(PickEnv, n_envs, seed=0, env_kwargs=kwargs)
+
+
+def make_model(algo: str, env: Any, policy: Any = POLICY, **kwargs: Any) -> Any:
+    settings: dict[str, Any] = dict(n_steps=8, policy_kwargs=dict(SMALL), seed=0, device="cpu", gamma=1.0)
+    if algo in ("ppo", "ppo_mask"):
+        settings.update(batch_size=16, n_epochs=2)
+    return ALGORITHMS[algo](policy, env, **{**settings, **kwargs})
+
+
+def make_policy(env: Any, **kwargs: Any) -> Any:
+    th.manual_seed(0)
+    policy = POLICY(env.observation_space, env.action_space, lambda _: 1e-3, **{**SMALL, **kwargs})
+    policy.set_training_mode(False)
+    return policy
+
+
+def tensors(observation: Any) -> Any:
+    return obs_as_tensor(observation, CPU)

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 from policy_helpers import LEVELS, SMALL, make_policy, make_vec
 from stable_baselines3 import PPO
-from test_policy_contracts import SUBCLASSES
+from test_policy_contracts import SUBCLASSES, GainAllocatorExtractor, GainRouterExtractor
 
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
@@ -14,18 +14,18 @@ from sb3_uav.reinforce import REINFORCE
 
 
 class GainAllocator(AllocatorPolicy):
-    extractor_class = SUBCLASSES["allocator"]
+    extractor_class = GainAllocatorExtractor
 
 
 class GainRouter(RouterPolicy):
-    extractor_class = SUBCLASSES["router"]
+    extractor_class = GainRouterExtractor
 
 
 @pytest.mark.parametrize("algorithm", [PPO, REINFORCE])
 @pytest.mark.parametrize("given", ["class", "dotted name", "subclass"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_algorithms_train_save_and_load_them(level, given, algorithm: Any, tmp_path):
-    extractor = SUBCLASSES[level]
+    extractor: Any = SUBCLASSES[level]
     subclass = GainAllocator if level == "allocator" else GainRouter
     named: Any = extractor if given == "class" else f"{extractor.__module__}.{extractor.__name__}"
     policy_kwargs: dict[str, Any] = {**SMALL, "sweep": False, "features_extractor_kwargs": dict(gain=2.0)}
@@ -36,7 +36,8 @@ def test_algorithms_train_save_and_load_them(level, given, algorithm: Any, tmp_p
     settings: dict[str, Any] = dict(n_steps=8, batch_size=16, n_epochs=1) if algorithm is PPO else {}
     model = algorithm(policy, env, policy_kwargs=policy_kwargs, seed=0, device="cpu", **settings).learn(64)
     assert type(model.policy.features_extractor) is extractor
-    assert model.policy.features_extractor.gain.item() != 2
+    learned: Any = model.policy.features_extractor
+    assert learned.gain.item() != 2
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=env, device="cpu")
     assert type(loaded.policy) is policy and type(loaded.policy.features_extractor) is extractor

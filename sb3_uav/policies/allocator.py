@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -212,7 +212,7 @@ class AllocatorPolicy(EpisodicPolicy):
     It takes any number of tasks and, with ``shared_scorer``, of UAVs; the paper's decoder is bound to one fleet size.
     """
 
-    extractor_class = AllocatorExtractor
+    extractor_class: ClassVar[type[AllocatorExtractor]] = AllocatorExtractor
     required_extractor_class = AllocatorExtractor
     features_extractor: AllocatorExtractor
     _order_is_checked = False

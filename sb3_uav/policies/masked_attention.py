@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -216,7 +216,7 @@ class MaskedAttentionPolicy(MaskedPolicy):
     :raises ValueError: If the observation or action space does not fit; the message names the key
     """
 
-    extractor_class = MaskedAttentionExtractor
+    extractor_class: ClassVar[type[MaskedAttentionExtractor]] = MaskedAttentionExtractor
     required_extractor_class = MaskedAttentionExtractor
     features_extractor: MaskedAttentionExtractor
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -185,7 +185,7 @@ class RouterPolicy(EpisodicPolicy):
     ``net_arch`` shapes the critic only, because the actor's logits are the extractor's compatibilities.
     """
 
-    extractor_class = RouterExtractor
+    extractor_class: ClassVar[type[RouterExtractor]] = RouterExtractor
     required_extractor_class = RouterExtractor
     features_extractor: RouterExtractor
 
