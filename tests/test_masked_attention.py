@@ -25,7 +25,7 @@ from sb3_uav.training.episode_buffer import use_episode_buffer
 
 @pytest.mark.parametrize("kind", [*KINDS, "knapsack.KnapsackEnv", "tsp.TSPEnv"])
 def test_environments_are_sound(kind):
-    """Those of the tests and of the examples. SB3 warns of the shape alone: it asks for the policy that these tests are about."""
+    """Those of the tests and of the examples. SB3 warns of the shape alone, and asks for a policy such as ours."""
     name, _, env_class = kind.partition(".")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
