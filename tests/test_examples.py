@@ -5,6 +5,7 @@ import re
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -98,8 +99,9 @@ def test_fine_tune(tmp_path):
     assert "router epoch 1 (alternate)" in printed
     changed = False
     for level, policy_class in (("allocator", AllocatorPolicy), ("router", RouterPolicy)):
-        tuned = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
-        changed |= not th.equal(*(p.encoder.embed_task.bias for p in (tuned.features_extractor, shipped(level))))
+        tuned: Any = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
+        before_and_after: Any = (tuned.features_extractor, shipped(level))
+        changed |= not th.equal(*(extractor.encoder.embed_task.bias for extractor in before_and_after))
     assert changed
     for decode in ("greedy", "sampling"):
         before, after, gain = numbers(
