@@ -41,8 +41,8 @@ from sb3_uav.zoo.tuning import register_search_spaces
 # Seeds of the instances on which settings are chosen, and of those on which the algorithms are compared.
 TUNING_SET, TEST_SET, TUNING_SEED = 1_001, 1_002, 100
 N_SAMPLES = 16
-# A rollout of PPO and A2C, and a batch of REINFORCE, before tuning.
-N_ENVS, N_EPISODES = 256, 512
+# Episodes in an update of REINFORCE and A2C, and in a rollout of PPO, which makes several updates of one; tuned.
+EPISODES = (32, 64, 128, 256)
 N_EVALUATIONS = 10
 # The budget of PPO's time is reached by training longer, at most by this factor.
 LONGEST = 10.0
@@ -151,12 +151,15 @@ class Study:
         algo, baseline = ARMS[arm]
         kwargs: dict[str, Any] = {"policy_kwargs": {"preset": self.preset, **self.part.network}}
         settings = {name: value for name, value in settings.items() if value is not None}
+        n_episodes = settings.pop("episodes")
         if algo != "reinforce":
             # Rollouts of whole episodes of the allocator; the router's episodes are shorter, and continue in the next rollout.
             n_steps = self.n_tasks if self.router is not None else min(self.n_tasks, 40)
-            return {**kwargs, "n_envs": N_ENVS, "n_steps": n_steps, "gamma": 1.0, **settings}
+            if "batch_size" in settings:
+                settings["batch_size"] = min(settings["batch_size"], n_episodes * n_steps)
+            return {**kwargs, "n_envs": n_episodes, "n_steps": n_steps, "gamma": 1.0, **settings}
         n_samples = settings.pop("n_samples", 1) if baseline == "shared" else 1
-        kwargs |= {"n_envs": max(N_EPISODES // n_samples, 1), "n_samples": n_samples}
+        kwargs["n_envs"] = max(n_episodes // n_samples, 1)
         if baseline == "rollout":
             settings["baseline_kwargs"] = {"n_test_instances": 1_000}
         return {**kwargs, **settings, "n_samples": n_samples, "baseline": baseline}
@@ -177,7 +180,8 @@ class Study:
             )
             while (number := len(self._finished(study))) < self.n_trials:
                 trial = study.ask()
-                settings = dict(HYPERPARAMS_SAMPLER[algo](trial, 0, N_ENVS, {}))
+                settings = dict(HYPERPARAMS_SAMPLER[algo](trial, 0, 0, {}))
+                settings["episodes"] = trial.suggest_categorical("episodes", EPISODES)
                 trial.set_user_attr("settings", settings)
                 score = self._try(arm, settings, f"{_slug(arm)}-{number}")
                 if score is None:

@@ -18,7 +18,7 @@ CITATIONS = {
     # The router's decoder: context; glimpse; clipped compatibilities.
     "sb3_uav.policies.router:RouterExtractor": {20, 22},
     # The gradient of the loss, and the gap.
-    "sb3_uav.reinforce.reinforce:REINFORCE._episode_loss": {24},
+    "sb3_uav.reinforce.losses:episode_loss": {24},
     "sb3_uav.evaluation.summary:gaps": {25},
 }
 

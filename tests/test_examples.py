@@ -5,6 +5,7 @@ import re
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -98,8 +99,9 @@ def test_fine_tune(tmp_path):
     assert "router epoch 1 (alternate)" in printed
     changed = False
     for level, policy_class in (("allocator", AllocatorPolicy), ("router", RouterPolicy)):
-        tuned = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
-        changed |= not th.equal(*(p.encoder.embed_task.bias for p in (tuned.features_extractor, shipped(level))))
+        tuned: Any = load_policy(tmp_path / "fine_tuned" / f"{level}.zip", expected=policy_class)
+        before_and_after: Any = (tuned.features_extractor, shipped(level))
+        changed |= not th.equal(*(extractor.encoder.embed_task.bias for extractor in before_and_after))
     assert changed
     for decode in ("greedy", "sampling"):
         before, after, gain = numbers(
@@ -146,3 +148,21 @@ def test_watch_training(tmp_path):
     assert (n_maps, n_allocator, n_router) == (3, 4, 12)
     with Image.open(tmp_path / "watch.png") as picture:
         assert picture.size[0] > 2 * picture.size[1] and len(picture.convert("RGB").getcolors(2**24) or ()) > 100
+
+
+@pytest.mark.slow
+def test_knapsack(tmp_path):
+    chance, greedy, learned, illegal = numbers(
+        rf"Value packed: {NUMBER} at random, {NUMBER} by value per weight, {NUMBER} learned; illegal: (\d+)",
+        run("knapsack", tmp_path, "--timesteps", "10000"),
+    )
+    assert chance < 4 < 4.8 < learned and 5 < greedy and illegal == 0
+
+
+@pytest.mark.slow
+def test_tsp(tmp_path):
+    chance, greedy, learned, illegal = numbers(
+        rf"Tour length: {NUMBER} at random, {NUMBER} to the nearest, {NUMBER} learned; illegal: (\d+)",
+        run("tsp", tmp_path, "--timesteps", "10000"),
+    )
+    assert learned < 3.8 < 5 < chance and 3 < greedy < 3.4 and illegal == 0

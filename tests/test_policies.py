@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_uav.envs import Instances, RoutePlanningEnv
-from sb3_uav.policies.base import sample_actions
+from sb3_uav.policies.masked_policy import sample_actions
 from sb3_uav.policies.static_observation import StaticObservation
 
 

@@ -21,6 +21,29 @@ from sb3_uav.policies.encoder import SelfAttention
 from sb3_uav.policies.settings import _PRESETS, NetworkSettings
 
 
+class GainAllocatorExtractor(AllocatorExtractor):
+    """An extractor of a user, with an argument of its own."""
+
+    def __init__(self, observation_space: Any, gain: float = 1.0, **settings: Any) -> None:
+        super().__init__(observation_space, **settings)
+        self.gain = nn.Parameter(th.tensor(gain))
+
+    def decode(self, cache: Any, state: Any) -> th.Tensor:
+        return self.gain * super().decode(cache, state)
+
+
+class GainRouterExtractor(RouterExtractor):
+    def __init__(self, observation_space: Any, gain: float = 1.0, **settings: Any) -> None:
+        super().__init__(observation_space, **settings)
+        self.gain = nn.Parameter(th.tensor(gain))
+
+    def decode(self, cache: Any, state: Any) -> th.Tensor:
+        return self.gain * super().decode(cache, state)
+
+
+SUBCLASSES = {"allocator": GainAllocatorExtractor, "router": GainRouterExtractor}
+
+
 @pytest.mark.parametrize("level", LEVELS)
 def test_policy_save_and_load_keep_every_argument(level, tmp_path):
     """None of them has its default value, and all are here: the keys are those of the constructor and the settings."""
@@ -41,6 +64,8 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         net_arch=dict(pi=[], vf=[8]),
         activation_fn=nn.ReLU,
         ortho_init=True,
+        features_extractor_class=SUBCLASSES[level],
+        features_extractor_kwargs=dict(gain=2.0),
         optimizer_class=th.optim.AdamW,
         optimizer_kwargs=dict(eps=1e-6, weight_decay=0.1),
     )

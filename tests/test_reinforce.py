@@ -20,7 +20,7 @@ from sb3_uav.envs import (
     nearest_feasible,
 )
 from sb3_uav.policies import AllocatorPolicy
-from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce import REINFORCE, losses
 
 # ------------------------------------------------------------------------------------------ learning
 
@@ -302,7 +302,7 @@ def test_a_loss_or_gradient_that_is_not_finite_stops_before_the_update(fused, ba
     learn()
     before = flat_parameters(model)
     if name == "loss":
-        monkeypatch.setattr(model, "_total_loss", lambda *args: bad * sum(p.sum() for p in model.policy.parameters()))
+        monkeypatch.setattr(losses, "_total_loss", lambda *args: bad * sum(p.sum() for p in model.policy.parameters()))
     else:
         next(model.policy.parameters()).register_hook(lambda gradient: gradient * bad)
     with pytest.raises(ValueError, match=rf"The {name} is (nan|-?inf) in update 2, after \d+ steps; .*smaller learning_rate"):

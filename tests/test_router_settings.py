@@ -139,7 +139,7 @@ def test_exactly_one_level_learns_at_any_time(network):
         def _on_step(self) -> bool:
             return True
 
-    learn_router = RouterTrainer.learn
+    learn_router: Any = RouterTrainer.learn
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RouterTrainer, "learn", lambda *args: learn_router(*args[:-1], [*args[-1], Other("router")]))
         learn(model, its, Other("allocator"))

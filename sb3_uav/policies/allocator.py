@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -15,10 +15,11 @@ from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.sweep import sweep_order
-from sb3_uav.policies.base import EpisodicPolicy, sample_actions
+from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.encoder import feed_forward
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
+from sb3_uav.policies.masked_policy import sample_actions
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import float32_on_cpu, is_recorded
@@ -206,12 +207,13 @@ def _at_steps(running: th.Tensor, steps: th.Tensor) -> th.Tensor:
 
 class AllocatorPolicy(EpisodicPolicy):
     """
-    The upper level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments.
+    The upper level's policy. See :class:`~sb3_uav.policies.masked_policy.MaskedPolicy` for the arguments.
 
     It takes any number of tasks and, with ``shared_scorer``, of UAVs; the paper's decoder is bound to one fleet size.
     """
 
-    extractor_class = AllocatorExtractor
+    extractor_class: ClassVar[type[AllocatorExtractor]] = AllocatorExtractor
+    required_extractor_class = AllocatorExtractor
     features_extractor: AllocatorExtractor
     _order_is_checked = False
 

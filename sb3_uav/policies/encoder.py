@@ -211,6 +211,34 @@ class _AttentionLayer(nn.Module):
         return self.feed_forward_norm(nodes + self.feed_forward(nodes), node_mask)
 
 
+class AttentionLayers(nn.ModuleList):
+    """
+    The attention layers of an encoder, one after the other.
+
+    :param settings: Shape of the network
+    """
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__(_AttentionLayer(settings) for _ in range(settings.n_layers))
+        self.mixed_precision = settings.mixed_precision
+
+    def forward(self, nodes: th.Tensor, node_mask: th.Tensor | None, coordinates: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param nodes: ``(batch, n_nodes, embed_dim)``
+        :param node_mask: ``(batch, n_nodes)`` bool, at least one in each row; None when all nodes are real
+        :param coordinates: ``(batch, n_nodes, 2)``, for ``relative`` attention
+        :return: ``(batch, n_nodes, embed_dim)``; those of padded nodes are arbitrary
+        """
+        attention_bias = None
+        if node_mask is not None:
+            attention_bias = th.zeros_like(node_mask, dtype=th.float32).masked_fill(~node_mask, -th.inf)[:, None, None]
+        # Sums and norms stay in float32.
+        with th.autocast(nodes.device.type, th.bfloat16, enabled=self.mixed_precision):
+            for layer in self:
+                nodes = layer(nodes, node_mask, attention_bias, coordinates)
+        return nodes
+
+
 class AttentionEncoder(nn.Module):
     """
     Embeds depot and tasks.
@@ -222,11 +250,10 @@ class AttentionEncoder(nn.Module):
         super().__init__()
         self.use_values = settings.use_values
         self.relative = settings.relative
-        self.mixed_precision = settings.mixed_precision
         # Relative to itself the depot has no position; what matters is how many tasks there are.
         self.embed_depot = nn.Linear(1 if self.relative else 2, settings.embed_dim)
         self.embed_task = nn.Linear((len(NodeFeature) if self.relative else 2) + self.use_values, settings.embed_dim)
-        self.layers = nn.ModuleList(_AttentionLayer(settings) for _ in range(settings.n_layers))
+        self.layers = AttentionLayers(settings)
 
     def forward(self, static: StaticObservation) -> th.Tensor:
         """
@@ -241,13 +268,8 @@ class AttentionEncoder(nn.Module):
         if self.use_values:
             features = th.cat([features, static.values[..., None]], dim=-1)
         nodes = th.cat([self.embed_depot(depot)[:, None], self.embed_task(features)], dim=1)
-        node_mask, attention_bias = None, None
+        node_mask = None
         # A recording must serve padded instances too.
         if is_recorded() or not static.task_mask.all():
             node_mask = th.cat([th.ones_like(static.task_mask[:, :1]), static.task_mask], dim=1)
-            attention_bias = th.zeros_like(node_mask, dtype=th.float32).masked_fill(~node_mask, -th.inf)[:, None, None]
-        # Sums and norms stay in float32.
-        with th.autocast(nodes.device.type, th.bfloat16, enabled=self.mixed_precision):
-            for layer in self.layers:
-                nodes = layer(nodes, node_mask, attention_bias, coordinates)
-        return nodes
+        return self.layers(nodes, node_mask, coordinates)

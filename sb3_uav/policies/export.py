@@ -27,7 +27,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_uav.policies.base import EpisodicPolicy
+from sb3_uav.policies.masked_policy import MaskedPolicy
 
 _OUTPUTS = ("action", "logits")
 
@@ -42,7 +42,7 @@ class ExportablePolicy(nn.Module):
     :raises ValueError: If there is no such output
     """
 
-    def __init__(self, policy: EpisodicPolicy, output: str = "action") -> None:
+    def __init__(self, policy: MaskedPolicy, output: str = "action") -> None:
         super().__init__()
         if output not in _OUTPUTS:
             raise ValueError(f"output is {output!r}; choose one of {_OUTPUTS}.")
@@ -70,7 +70,7 @@ class ExportablePolicy(nn.Module):
         """
         inputs = []
         for space in self._spaces.values():
-            shape, dtype = (batch_size, *(space.shape or ())), th.from_numpy(space.sample()).dtype
+            shape, dtype = (batch_size, *(space.shape or ())), th.as_tensor(space.sample()).dtype
             inputs.append(th.ones(shape, dtype=dtype, device=self.policy.device))
         return tuple(inputs)
 

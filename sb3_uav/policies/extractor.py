@@ -1,4 +1,4 @@
-"""Feature extractors that encode an instance once and decode it many times."""
+"""Feature extractors that encode the unchanging part of observations once and decode it many times."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
 
 from sb3_uav.envs.problem import STATIC_KEYS
 from sb3_uav.policies.encoder import AttentionEncoder
 from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.static_rows import changed_rows, copy_rows, distinct_rows, have_equal_shapes, select_rows
 from sb3_uav.policies.torch_state import ModuleContents, is_recorded
 
 CacheT = TypeVar("CacheT", bound="Cache")
@@ -29,10 +31,10 @@ _MAX_FILLING = 4
 @dataclass(frozen=True)
 class Cache:
     """
-    The encodings of ``batch`` instances. Every tensor leads with the batch dimension; each level adds what its decoder
+    The encodings of ``batch`` instances. Every tensor leads with the batch dimension; each network adds what its decoder
     computes in advance: tensors, named tuples of tensors, or None.
 
-    :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``, the depot first
+    :param nodes: Node embeddings ``(batch, n_nodes, embed_dim)``; of our environments the depot first, then the tasks
     """
 
     nodes: th.Tensor
@@ -83,16 +85,16 @@ class _Kept(NamedTuple):
     Encodings, and everything that they depend on.
 
     :param contents: Parameters and buffers of the extractor
-    :param static: Copy of the observations, because an environment may write its next one into the same memory
-    :param cache: Their encodings, the level's :class:`Cache`
+    :param static: Copy of the static part, because an environment may write its next observation into the same memory
+    :param cache: Their encodings, the network's :class:`Cache`
     """
 
     contents: ModuleContents
-    static: StaticObservation
+    static: Any
     cache: Any
 
 
-class EpisodicExtractor(BaseFeaturesExtractor):
+class EncodeOnceExtractor(BaseFeaturesExtractor):
     """
     An attention encoder and the part of the decoder before the action distribution, as an SB3 features extractor.
 
@@ -105,47 +107,39 @@ class EpisodicExtractor(BaseFeaturesExtractor):
     buffer says which transitions belong together (key ``episode_index``, int64, beside static parts that stand once per
     episode); with SB3's own buffers it looks for equal rows itself. ``use_cache`` and ``share_encodings`` turn the two off.
 
-    :param observation_space: Observation space of one of our environments
+    What the static part is, a subclass says: a named tuple of tensors, made from the observation's ``static_keys``.
+
+    :param observation_space: Observation space
     :param features_dim: Size of the features
-    :param settings: What shapes the network
+    :param encoder: Takes the static part of ``batch`` observations, gives node embeddings ``(batch, n_nodes, embed_dim)``
     """
 
-    # Which environment it is for, and an observation key that only this one has.
-    environment: ClassVar[str]
-    own_key: ClassVar[str]
+    # Keys of the observation that make up the static part.
+    static_keys: tuple[str, ...]
     # Size of what follows the logits in the features, if the features begin with the logits of the actions.
     context_dim: int | None = None
 
-    def __init__(self, observation_space: spaces.Space, features_dim: int, settings: NetworkSettings) -> None:
+    def __init__(self, observation_space: spaces.Space, features_dim: int, encoder: nn.Module) -> None:
         super().__init__(observation_space, features_dim)
-        self.encoder = AttentionEncoder(settings)
+        self.encoder = encoder
         self.use_cache = True
         self.share_encodings = True
         self.n_encoded_rows = 0
         self._kept: _Kept | None = None
 
-    @classmethod
-    def n_actions(cls, observation_space: spaces.Space) -> int:
+    @abstractmethod
+    def static_part(self, observation: TensorDict) -> Any:
         """
-        :param observation_space: Observation space that the extractor is to be made for
-        :return: Number of actions
-        :raises ValueError: If it is not that of this level's environment
+        :param observation: A batch of preprocessed observations
+        :return: The part that is encoded, a named tuple of tensors that lead with the batch dimension
         """
-        if not isinstance(observation_space, spaces.Dict) or "action_mask" not in observation_space.spaces:
-            raise ValueError(f"{cls.__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}.")
-        if cls.own_key not in observation_space.spaces:
-            raise ValueError(
-                f"{cls.__name__} needs the observation of a {cls.environment} environment, but its keys "
-                f"{sorted(observation_space.spaces)} lack {cls.own_key!r}; use the policy of the other level."
-            )
-        return int(observation_space["action_mask"].shape[0])  # type: ignore[index]
 
     @abstractmethod
-    def precompute(self, nodes: th.Tensor, static: StaticObservation) -> Any:
+    def precompute(self, nodes: th.Tensor, static: Any) -> Any:
         """
-        :param nodes: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
-        :param static: The observations they were made from
-        :return: Everything that decoding needs, the level's :class:`Cache`
+        :param nodes: Node embeddings ``(batch, n_nodes, embed_dim)``
+        :param static: The static part they were made from
+        :return: Everything that decoding needs, the network's :class:`Cache`
         """
 
     @abstractmethod
@@ -164,13 +158,13 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         :return: Features ``(batch, n_samples, features)``
         """
 
-    def encode(self, static: StaticObservation) -> Any:
+    def encode(self, static: Any) -> Any:
         """
-        :param static: ``batch`` instances
-        :return: Their encodings, the level's :class:`Cache`
+        :param static: The static part of ``batch`` observations
+        :return: Their encodings, the network's :class:`Cache`
         """
         if not is_recorded():
-            self.n_encoded_rows += len(static.depot)
+            self.n_encoded_rows += len(static[0])
         return self.precompute(self.encoder(static), static)
 
     def forward(self, observations: TensorDict) -> th.Tensor:
@@ -179,14 +173,14 @@ class EpisodicExtractor(BaseFeaturesExtractor):
             ``episode_index``
         :return: ``(batch, features_dim)``
         """
-        static = StaticObservation.from_observation(observations)
-        dynamic = {key: value for key, value in observations.items() if key not in STATIC_KEYS}
+        static = self.static_part(observations)
+        dynamic = {key: value for key, value in observations.items() if key not in self.static_keys}
         index = dynamic.pop(EPISODE_INDEX, None)
         if index is None and th.is_grad_enabled() and self.share_encodings and not is_recorded():
-            static, index = static.unique()
+            static, index = distinct_rows(static)
         if index is None:
             return self._decode_each(self._encode_cached(static), dynamic)
-        grouping = Grouping.by_instance(index, len(static.depot))
+        grouping = Grouping.by_instance(index, len(static[0]))
         cache = self.encode(static)
         if grouping.source.numel() > _MAX_FILLING * len(index):
             return self._decode_each(cache.rows(index), dynamic)
@@ -198,35 +192,79 @@ class EpisodicExtractor(BaseFeaturesExtractor):
         state = self.observed_state(cache, {key: value[:, None] for key, value in dynamic.items()})
         return self.decode(cache, state)[:, 0]
 
-    def _encode_cached(self, static: StaticObservation) -> Cache:
+    def _encode_cached(self, static: Any) -> Cache:
         if self.training or th.is_grad_enabled() or not self.use_cache or is_recorded():
             return self.encode(static)
         contents, kept = ModuleContents(self), self._kept
-        if kept is None or kept.contents != contents or kept.static.tasks.shape != static.tasks.shape:
+        if kept is None or kept.contents != contents or not have_equal_shapes(kept.static, static):
             cache = self.encode(static)
         else:
-            rows, cache = kept.static.changed_rows(static), kept.cache
+            rows, cache = changed_rows(kept.static, static), kept.cache
             if len(rows) == 0:
                 return cache
-            if len(rows) == len(static.depot):
+            if len(rows) == len(static[0]):
                 cache = self.encode(static)
             else:
-                cache = cache.update_rows(rows, self.encode(static.rows(rows)))
-        self._kept = _Kept(contents, static.clone(), cache)
+                cache = cache.update_rows(rows, self.encode(select_rows(static, rows)))
+        self._kept = _Kept(contents, copy_rows(static), cache)
         return cache
 
     def clear_cache(self) -> None:
         """Forget the kept encodings."""
         self._kept = None
 
-    def train(self, mode: bool = True) -> EpisodicExtractor:
+    def train(self, mode: bool = True) -> EncodeOnceExtractor:
         if mode:
             self.clear_cache()
         return super().train(mode)
 
-    def _apply(self, *args: Any, **kwargs: Any) -> EpisodicExtractor:
+    def _apply(self, *args: Any, **kwargs: Any) -> EncodeOnceExtractor:
         self.clear_cache()
         return super()._apply(*args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_kept": None}
+
+
+class EpisodicExtractor(EncodeOnceExtractor):
+    """
+    The extractor of one level of our environments.
+
+    :param observation_space: Observation space of one of our environments
+    :param features_dim: Size of the features
+    :param settings: What shapes the network
+    """
+
+    # Which environment it is for, and an observation key that only this one has.
+    environment: ClassVar[str]
+    own_key: ClassVar[str]
+    static_keys = STATIC_KEYS
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int, settings: NetworkSettings) -> None:
+        super().__init__(observation_space, features_dim, AttentionEncoder(settings))
+
+    @classmethod
+    def n_actions(cls, observation_space: spaces.Space) -> int:
+        """
+        :param observation_space: Observation space that the extractor is to be made for
+        :return: Number of actions
+        :raises ValueError: If it is not that of this level's environment
+        """
+        remedy = (
+            f"make it for a {cls.environment} environment of sb3_uav; for one of your own use MaskedAttentionPolicy, "
+            "whose policy_kwargs name the keys, such as dict(node_key='nodes', mask_key='action_mask')"
+        )
+        if not isinstance(observation_space, spaces.Dict):
+            raise ValueError(
+                f"{cls.__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}; {remedy}."
+            )
+        missing = sorted({*cls.static_keys, cls.own_key, "action_mask"} - set(observation_space.spaces))
+        if missing:
+            raise ValueError(
+                f"{cls.__name__} needs the observation of a {cls.environment} environment, but its keys "
+                f"{sorted(observation_space.spaces)} lack {missing}; {remedy}."
+            )
+        return int(observation_space["action_mask"].shape[0])  # type: ignore[index]
+
+    def static_part(self, observation: TensorDict) -> StaticObservation:
+        return StaticObservation.from_observation(observation)

@@ -134,6 +134,11 @@ def read_policy(path: str | os.PathLike[str], expected: type[EpisodicPolicy] | N
     file = _existing_file(Path(path))
     data, parameters = _read_zip(file)
     policy_class = next((cls for key, cls in _SIGNATURES.items() if key in parameters), None)
+    if "features_extractor.encoder.embed_node.weight" in parameters:
+        raise NotOurPolicyError(
+            f"{file}: holds a MaskedAttentionPolicy, whose spaces are stored as a pickle, which is not executed here; if you "
+            "trust the file, load it with the algorithm's own load() and use model.policy."
+        )
     if policy_class is None:
         raise NotOurPolicyError(
             f"{file}: holds the policy of another kind (its first parameter is {next(iter(parameters), 'missing')!r}); "
@@ -148,6 +153,7 @@ def read_policy(path: str | os.PathLike[str], expected: type[EpisodicPolicy] | N
         if not th.isfinite(parameter).all():
             found = parameter[~th.isfinite(parameter)].flatten()[0].item()
             raise ValueError(f"{file}: parameter '{name}' holds {found}; the training diverged, use an earlier checkpoint.")
+    _check_stock_code(data, file)
     return StoredPolicy(file, policy_class, parameters, data)
 
 
@@ -234,3 +240,21 @@ def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:
                 "load it with the algorithm's own load() and use model.policy."
             )
     return policy_kwargs
+
+
+def _check_stock_code(data: dict[str, Any], file: Path) -> None:
+    """
+    :param data: The JSON of an SB3 zip
+    :param file: The zip, named in errors
+    :raises NotOurPolicyError: If the policy or its extractor is a class of a user, which acts otherwise and is not imported
+    """
+    policy_class, policy_kwargs = data.get("policy_class"), data.get("policy_kwargs")
+    module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
+    extractor = policy_kwargs.get("features_extractor_class") if isinstance(policy_kwargs, dict) else None
+    for what, found in (("policy is a class of the module", module), ("features_extractor_class is", extractor)):
+        name = str(found).removeprefix("<class '")
+        if found is not None and name.partition(".")[0] not in ("sb3_uav", "stable_baselines3", "sb3_contrib"):
+            raise NotOurPolicyError(
+                f"{file}: its {what} {found!r}, which is not imported here; if you trust the file, load it with the "
+                "algorithm's own load() and use model.policy."
+            )

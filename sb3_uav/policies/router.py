@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -15,9 +15,10 @@ from torch.nn import functional
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value
-from sb3_uav.policies.base import EpisodicPolicy, sample_actions
+from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.encoder import attend
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
+from sb3_uav.policies.masked_policy import sample_actions
 from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
@@ -178,13 +179,14 @@ class RouterExtractor(EpisodicExtractor):
 
 class RouterPolicy(EpisodicPolicy):
     """
-    The lower level's policy. See :class:`~sb3_uav.policies.base.EpisodicPolicy` for the arguments.
+    The lower level's policy. See :class:`~sb3_uav.policies.masked_policy.MaskedPolicy` for the arguments.
 
     It takes any number of tasks.
     ``net_arch`` shapes the critic only, because the actor's logits are the extractor's compatibilities.
     """
 
-    extractor_class = RouterExtractor
+    extractor_class: ClassVar[type[RouterExtractor]] = RouterExtractor
+    required_extractor_class = RouterExtractor
     features_extractor: RouterExtractor
 
     @classmethod

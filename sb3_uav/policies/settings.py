@@ -15,7 +15,7 @@ class NetworkSettings:
     What shapes a network. Both levels take all of it; each level leaves out what it has no use for.
 
     The defaults are those of the feature extractors in SB3's own policies: a network of the paper's size without running
-    statistics, which PPO needs. :class:`~sb3_uav.policies.base.EpisodicPolicy` starts from a preset instead.
+    statistics, which PPO needs. The policies start from a preset instead.
 
     :param embed_dim: Size of the embeddings
     :param n_layers: Number of attention layers

@@ -49,31 +49,3 @@ class StaticObservation(NamedTuple):
             task_mask=instances.task_mask,
             max_distance=instances.max_distance.float()[:, None],
         )
-
-    def rows(self, rows: th.Tensor) -> StaticObservation:
-        """
-        :param rows: ``(n,)`` int64
-        :return: These rows, in this order
-        """
-        return StaticObservation(*(field[rows] for field in self))
-
-    def unique(self) -> tuple[StaticObservation, th.Tensor]:
-        """
-        :return: The distinct rows, and the index among them of every row, ``(batch,)`` int64
-        """
-        flat = th.cat([field.flatten(1).float() for field in self], dim=1)
-        different, index = flat.unique(dim=0, return_inverse=True)
-        # Any row of each kind; index_copy with repeated targets keeps one of them.
-        row = th.arange(len(index), device=index.device)
-        return self.rows(index.new_zeros(len(different)).index_copy(0, index, row)), index
-
-    def changed_rows(self, other: StaticObservation) -> th.Tensor:
-        """
-        :param other: As many observations of the same size
-        :return: ``(n,)`` int64, the rows that differ in any field
-        """
-        return th.stack([(old != new).flatten(1).any(1) for old, new in zip(self, other, strict=True)]).any(0).nonzero()[:, 0]
-
-    def clone(self) -> StaticObservation:
-        """:return: A copy that shares no memory"""
-        return StaticObservation(*(field.clone() for field in self))

@@ -7,7 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_uav.policies import EpisodicPolicy
+from sb3_uav.policies import EpisodicPolicy, MaskedAttentionPolicy
 from sb3_uav.reinforce.recognition import why_unrecognized
 
 # Settings of REINFORCE that only one of the drivers uses, with their defaults.
@@ -21,6 +21,8 @@ def why_step_loop(policy_class: type, env: VecEnv | None) -> str:
     :param env: The environment of the algorithm
     :return: The reason why the fused driver cannot be used, a clause without a period
     """
+    if issubclass(policy_class, MaskedAttentionPolicy):
+        return f"{policy_class.__name__} is for environments that can only be stepped"
     if not issubclass(policy_class, EpisodicPolicy):
         return f"{policy_class.__name__} is not a policy of sb3_uav"
     return "no environment is set" if env is None else why_unrecognized(env)

@@ -22,7 +22,6 @@ from stable_baselines3.common.policies import (
     MultiInputActorCriticPolicy,
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
@@ -30,13 +29,15 @@ from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
-from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, RouterPolicy
-from sb3_uav.reinforce.advantages import complete_steps, scale_advantages, step_advantages
+from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, MaskedAttentionPolicy, RouterPolicy
+from sb3_uav.reinforce.advantages import complete_steps, step_advantages
 from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
 from sb3_uav.reinforce.finite import require_finite
+from sb3_uav.reinforce.losses import episode_loss, step_loss
+from sb3_uav.reinforce.masked_steps import MaskedStepLoop
 from sb3_uav.reinforce.monitor_rows import log_episodes
 from sb3_uav.reinforce.recognition import find_problem
 
@@ -49,7 +50,7 @@ NO_STEP_LIMIT = 2**62
 _NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
 
 
-class REINFORCE(AnySizeAlgorithm):
+class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
     """
     REINFORCE with a choice of baselines.
 
@@ -57,7 +58,8 @@ class REINFORCE(AnySizeAlgorithm):
     policy's device (the fused driver): one encoding, ``n_samples`` episodes per instance, one gradient pass over all their
     steps, one update. With any other policy or environment, SB3's loop collects ``n_steps`` steps per environment, and the
     episodes that are completed in them are used for training; the baselines ``shared`` and ``rollout``, which replay
-    instances, are then not available. Settings without effect are reported by a warning.
+    instances, are then not available. Settings without effect are reported by a warning. Policies of sb3-contrib get the
+    environment's action masks, see :class:`~sb3_uav.reinforce.masked_steps.MaskedStepLoop`.
 
     Training stops with a ``ValueError`` before an update whose loss or gradient is not finite.
 
@@ -93,6 +95,7 @@ class REINFORCE(AnySizeAlgorithm):
         "MultiInputPolicy": MultiInputActorCriticPolicy,
         "AllocatorPolicy": AllocatorPolicy,
         "RouterPolicy": RouterPolicy,
+        "MaskedAttentionPolicy": MaskedAttentionPolicy,
     }
 
     # SB3 declares an ActorCriticPolicy, which ours are not.
@@ -301,7 +304,7 @@ class REINFORCE(AnySizeAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         batch, self._batch = self._batch, None
-        loss = self._step_loss() if batch is None else self._episode_loss(batch)
+        loss = step_loss(self) if batch is None else episode_loss(self, batch)
         self.policy.optimizer.zero_grad()
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
@@ -324,49 +327,6 @@ class REINFORCE(AnySizeAlgorithm):
                 self.epoch = complete - 1
                 self._baseline.end_epoch(problem)
                 self.epoch = complete
-
-    def _episode_loss(self, batch: EpisodeBatch) -> th.Tensor:
-        """mean((baseline - return) * sum of log-probabilities) (paper, equation (24))."""
-        assert isinstance(self.policy, EpisodicPolicy) and self.problem is not None
-        evaluation = self.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
-        value_loss = None
-        if self.baseline == "critic":
-            # Actions after the end of an episode are padding.
-            lengths = self.problem.lengths(batch.instances, batch.actions)
-            real = th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
-            to_go, values = batch.rewards_to_go(self.problem)[real], evaluation.values[real]
-            value_loss = ((to_go - values) ** 2).mean()
-            variance = explained_variance(values.detach().cpu().numpy(), to_go.cpu().numpy())
-            self.logger.record("train/explained_variance", float(variance))
-            weighted = th.zeros_like(evaluation.log_prob)
-            weighted[real] = self._normalized(to_go - values.detach()) * evaluation.log_prob[real]
-        else:
-            self.logger.record("train/baseline", batch.baseline.mean().item())
-            advantages = self._normalized((batch.returns - batch.baseline).float())
-            weighted = advantages[..., None] * evaluation.log_prob
-        policy_loss = -weighted.sum(-1).mean()
-        return self._total_loss(policy_loss, evaluation.entropy.sum(-1).mean(), value_loss)
-
-    def _normalized(self, advantages: th.Tensor) -> th.Tensor:
-        return scale_advantages(advantages) if self.normalize_advantage else advantages
-
-    def _step_loss(self) -> th.Tensor:
-        data = next(self.rollout_buffer.get(batch_size=None))
-        values, log_prob, entropy = self.policy.evaluate_actions(data.observations, data.actions.flatten().long())
-        value_loss = None
-        if self.baseline == "critic":
-            value_loss = ((data.returns - values.flatten()) ** 2).mean()
-        mean_entropy = -log_prob.mean() if entropy is None else entropy.mean()
-        return self._total_loss(-(data.advantages * log_prob).mean(), mean_entropy, value_loss)
-
-    def _total_loss(self, policy_loss: th.Tensor, entropy: th.Tensor, value_loss: th.Tensor | None) -> th.Tensor:
-        self.logger.record("train/policy_gradient_loss", policy_loss.item())
-        self.logger.record("train/entropy_loss", -entropy.item())
-        loss = policy_loss - self.ent_coef * entropy
-        if value_loss is not None:
-            self.logger.record("train/value_loss", value_loss.item())
-            loss = loss + self.vf_coef * value_loss
-        return loss
 
     # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L287
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:

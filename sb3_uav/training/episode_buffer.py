@@ -22,8 +22,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_uav.envs.problem import STATIC_KEYS
-from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.grouping import EPISODE_INDEX
+from sb3_uav.policies.masked_policy import MaskedPolicy
 
 
 class EpisodeRolloutBuffer(DictRolloutBuffer):
@@ -43,7 +43,8 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: Factor for trade-off of bias vs variance for Generalized Advantage Estimator
     :param gamma: Discount factor
     :param n_envs: Number of parallel environments
-    :raises ValueError: If the observation space is not that of one of our environments
+    :param static_keys: Keys of the observation that an episode keeps; those that the policy encodes
+    :raises ValueError: If the observation space has not these keys and others
     """
 
     _starts: np.ndarray
@@ -60,20 +61,22 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
         gae_lambda: float = 1,
         gamma: float = 0.99,
         n_envs: int = 1,
+        static_keys: tuple[str, ...] = STATIC_KEYS,
     ):
-        if not isinstance(observation_space, spaces.Dict) or not set(STATIC_KEYS) < set(observation_space.spaces):
+        if not isinstance(observation_space, spaces.Dict) or not set(static_keys) < set(observation_space.spaces):
             raise ValueError(
-                f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, found {observation_space}; "
-                "use SB3's own buffer."
+                f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, or rollout_buffer_kwargs="
+                f"dict(static_keys=...) for another one, found {observation_space}; or use SB3's own buffer."
             )
+        self.static_keys = static_keys
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
     def reset(self) -> None:
-        for key in STATIC_KEYS:
+        for key in self.static_keys:
             # The parent class allocates a row per step for every key of obs_shape.
             self.obs_shape.pop(key, None)
         super().reset()
-        self._static: dict[str, list[np.ndarray]] = {key: [] for key in STATIC_KEYS}
+        self._static: dict[str, list[np.ndarray]] = {key: [] for key in self.static_keys}
         self._n_fragments = 0
         self._current = np.zeros(self.n_envs, dtype=np.int64)
         self._fragments = np.zeros((self.buffer_size, self.n_envs), dtype=np.int64)
@@ -98,8 +101,8 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
         :param kwargs: What a parent class takes besides
         """
         if self.pos == 0:
-            self._latest = {key: np.array(obs[key], dtype=self.observation_space[key].dtype) for key in STATIC_KEYS}
-        changed = [(obs[key] != latest).any(axis=1) for key, latest in self._latest.items()]
+            self._latest = {key: np.array(obs[key], dtype=self.observation_space[key].dtype) for key in self.static_keys}
+        changed = [(obs[key] != latest).reshape(self.n_envs, -1).any(axis=1) for key, latest in self._latest.items()]
         started = np.flatnonzero(np.logical_or.reduce([episode_start, *changed]) | (self.pos == 0))
         if len(started) > 0:
             self._current[started] = self._n_fragments + np.arange(len(started))
@@ -181,10 +184,10 @@ def use_episode_buffer(model: BaseAlgorithm) -> None:
     :param model: The algorithm, between two rollouts
     :raises ValueError: If the algorithm, its policy or its buffer is of another kind
     """
-    if not isinstance(model, OnPolicyAlgorithm) or not isinstance(model.policy, EpisodicPolicy):
+    if not isinstance(model, OnPolicyAlgorithm) or not isinstance(model.policy, MaskedPolicy):
         raise ValueError(
-            "The episode rollout buffer is for PPO, A2C and MaskablePPO with AllocatorPolicy or RouterPolicy, found "
-            f"{type(model).__name__} with {type(model.policy).__name__}."
+            "The episode rollout buffer is for PPO, A2C and MaskablePPO with AllocatorPolicy, RouterPolicy or "
+            f"MaskedAttentionPolicy, found {type(model).__name__} with {type(model.policy).__name__}."
         )
     buffer = model.rollout_buffer
     if isinstance(buffer, EpisodeRolloutBuffer):
@@ -203,6 +206,7 @@ def use_episode_buffer(model: BaseAlgorithm) -> None:
         gae_lambda=buffer.gae_lambda,
         gamma=buffer.gamma,
         n_envs=buffer.n_envs,
+        static_keys=model.policy.features_extractor.static_keys,
     )
 
 
