@@ -259,6 +259,16 @@ def test_fig5_leaves_out_what_it_says(out: Path) -> None:
 
 
 @pytest.mark.slow
+def test_without_the_shipped_pair(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(out / "models", tmp_path / "models")
+    assert run("fig7", "--train-pair", "--scale", "smoke", "--solvers", "kmeans-am", "--out", tmp_path) == 0
+    _, rows, comments = read_table(tmp_path / "fig7.csv")
+    assert [row["Method"] for row in rows] == ["mixture", "K-means+AM", "DL-DRL-I", "Untrained"]
+    assert any(comment.startswith("# mixture: DL-DRL.") for comment in comments)
+    assert "K-means+AM mixture on U6-N80" in capsys.readouterr().err and not (tmp_path / "training").exists()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name, fleet", [("fig6", "U4"), ("fig7", "U6")])
 def test_figs6_and_7(name: str, fleet: str, out: Path) -> None:
     columns, rows, _ = read_table(out / f"{name}.csv")
