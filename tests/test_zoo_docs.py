@@ -66,7 +66,8 @@ def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     entries["TaskAllocation-v0"] |= dict(policy_kwargs=NETWORK, n_envs=2, n_samples=2, n_timesteps=80, instances_per_epoch=2)
     Path("my_fleet.yml").write_text(yaml.safe_dump(entries))
     plain = {key: value for key, value in entry(n_timesteps=40).items() if key != "callback"}
-    Path("tiny.yml").write_text(yaml.safe_dump({ENV: entry(), "TaskAllocation-v0": {**plain, "n_envs": 2}}))
+    others = {name: {**plain, "n_envs": 2} for name in ("TaskAllocation-v0", "TaskAllocation-U4-N80-v0")}
+    Path("tiny.yml").write_text(yaml.safe_dump({ENV: entry(), **others}))
 
     listed = commands()
     assert {words[1] for words in listed} >= {*NEEDED, "train", "enjoy", "benchmark", "load-from-hub"}

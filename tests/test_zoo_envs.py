@@ -24,6 +24,7 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.studies.compare.variants import read_variants
 from sb3_uav.zoo import enjoy, train
+from sb3_uav.zoo.configs import default_config, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 
 GENERIC, NEW = "TaskAllocation-v0", "TaskAllocation-U2-N9-v0"
@@ -107,9 +108,13 @@ SIZES: dict[str, Any] = {"TaskAllocation-U4-N80-v0": {}, "TaskAllocation-U6-N200
         (SIZES, GENERIC, {"n_tasks": 300, "n_uavs": 7}, "TaskAllocation-U6-N200-v0"),
         (SIZES, GENERIC, {}, "TaskAllocation-U4-N80-v0"),
         (SIZES, "RoutePlanning-N9-v0", {}, "RoutePlanning-N80-v0"),
-        ({**SIZES, GENERIC: {}}, "TaskAllocation-U6-N210-v0", {}, GENERIC),
+        ({**SIZES, GENERIC: {}}, "TaskAllocation-U6-N210-v0", {}, "TaskAllocation-U6-N200-v0"),
+        ({**SIZES, GENERIC: {}}, GENERIC, {"n_tasks": 210}, GENERIC),
+        ({"RoutePlanning-N80-v0": {}, GENERIC: {}}, "TaskAllocation-U6-N210-v0", {}, GENERIC),
+        (SIZES, GENERIC, {"n_tasks": "many"}, "TaskAllocation-U4-N80-v0"),
         ({**SIZES, GENERIC: {}}, "RoutePlanning-N9-v0", {}, "RoutePlanning-N80-v0"),
-        ({**SIZES, "default": {}}, "TaskAllocation-U6-N210-v0", {}, None),
+        ({**SIZES, "default": {}}, "TaskAllocation-U6-N210-v0", {}, "TaskAllocation-U6-N200-v0"),
+        ({"default": {}}, "TaskAllocation-U6-N210-v0", {}, None),
         (SIZES, "TaskAllocation-Universal-v0", {}, None),
         (SIZES, "CartPole-v1", {}, None),
         ({"CartPole-v1": {}}, "TaskAllocation-U4-N80-v0", {}, None),
@@ -120,6 +125,21 @@ def test_the_entry_of_an_environment(
     entries: dict[Any, Any], env_id: str, env_kwargs: dict[str, Any], expected: str | None
 ) -> None:
     assert find_entry(entries, env_id, env_kwargs) == expected
+
+
+@pytest.mark.parametrize("algo", ["reinforce", "ppo", "ppo_mask", "a2c"])
+def test_other_sizes_get_the_recipe_of_the_nearest_one(algo: str) -> None:
+    """The fault was the recipe for 80 tasks, scaled: four times the steps of that for 500."""
+    path = default_config(algo)
+    assert path is not None
+    entries = read_yaml(path)
+    ensure_registered("TaskAllocation-U5-N450-v0")
+    large, kwargs = "TaskAllocation-U6-N500-v0", {"n_tasks": 450, "n_uavs": 5}
+    assert find_entry(entries, "TaskAllocation-U5-N450-v0") == find_entry(entries, GENERIC, kwargs) == large
+    scaled = scaled_values(entries[large], large, GENERIC, kwargs)
+    assert scaled["n_timesteps"] == entries[large]["n_timesteps"] * 450 / 500
+    assert find_entry(entries, GENERIC) == "TaskAllocation-U4-N80-v0"
+    assert find_entry(entries, "RoutePlanning-v0", {"n_tasks": 160}) == "RoutePlanning-N150-v0"
 
 
 def test_an_allocators_entry_is_scaled_to_the_length_of_its_episodes() -> None:

@@ -16,20 +16,19 @@ def find_entry(entries: Mapping[Any, Any], env_id: str, env_kwargs: Mapping[str,
     :param entries: The entries of a YAML
     :param env_id: Id of a registered environment
     :param env_kwargs: Arguments of the environment
-    :return: Its own entry; else, of an environment of ours of any size, that of ``TaskAllocation-v0`` or ``RoutePlanning-v0``;
-        else that of the nearest size, unless there is a ``default``; None if there is none of these
+    :return: Its own entry; else, of an environment of ours of any size, that of the nearest size; else that of
+        ``TaskAllocation-v0`` or ``RoutePlanning-v0``; None if there is none of these
     """
-    if env_id in entries:
-        return env_id
     generic = _level(env_id)
-    if generic is None or generic in entries:
-        return generic
-    size = _size(env_id, env_kwargs or {})
-    if size is None or "default" in entries:
-        return None
+    if env_id in entries or generic is None:
+        return env_id if env_id in entries else None
+    # A size that is no number ends the command when the environment is made, which names the argument.
+    size = _size(env_id, env_kwargs or {}) or _size(env_id, {})
     sizes = {str(name): size_of(str(name)) for name in entries if _level(str(name)) == generic}
-    distances = {name: _distance(size, other) for name, other in sizes.items() if other is not None}
-    return min(distances, key=lambda name: distances[name]) if distances else None
+    distances = {name: _distance(size, other) for name, other in sizes.items() if size is not None and other is not None}
+    if distances:
+        return min(distances, key=lambda name: distances[name])
+    return generic if generic in entries else None
 
 
 def scaled_values(
