@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ from sb3_uav.studies.compare.variants import read_variants
 from sb3_uav.zoo import enjoy, train
 from sb3_uav.zoo.configs import default_config, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
+from sb3_uav.zoo.experiment import UAVExperimentManager
 
 GENERIC, NEW = "TaskAllocation-v0", "TaskAllocation-U2-N9-v0"
 
@@ -153,6 +155,8 @@ def test_an_allocators_entry_is_scaled_to_the_length_of_its_episodes() -> None:
     sized = {**allocator, "env_kwargs": {"n_tasks": 60}}
     assert scaled_values(sized, GENERIC, GENERIC) == {}
     assert scaled_values(sized, GENERIC, GENERIC, {"n_tasks": 120}) == {"n_timesteps": 16000}
+    # The arguments that are given replace those of the entry as a whole.
+    assert scaled_values(sized, GENERIC, GENERIC, {"n_uavs": 3}) == {"n_timesteps": 10667}
     # Tours end when the distance is used up, whatever the number of tasks.
     assert scaled_values(allocator, "RoutePlanning-N80-v0", "RoutePlanning-N20-v0") == {}
     assert scaled_values(allocator, "CartPole-v1", "CartPole-v1") == {}
@@ -186,6 +190,20 @@ def test_an_id_of_any_size_trains_and_is_replayed(tmp_path: Path, capsys: Any) -
     assert enjoy.main(["--env", NEW, "-f", str(tmp_path / "logs"), "-n", "18", "--no-render"]) == 0
     printed = capsys.readouterr().out
     assert "2 Episodes" in printed and "Mean episode length: 9.00" in printed
+
+
+@pytest.mark.parametrize("custom", [{}, {"n_steps": 7}])
+def test_arguments_of_the_command_line_scale_an_entry_with_its_own(tmp_path: Path, custom: dict[str, Any]) -> None:
+    """The fault was the number of steps of the entry's own size, 5, for 10 tasks."""
+    config = tmp_path / "own.yml"
+    settings = dict(policy="AllocatorPolicy", n_timesteps=100, n_steps=5, env_kwargs=dict(n_tasks=5, n_uavs=2))
+    config.write_text(yaml.safe_dump({GENERIC: settings}))
+    args = argparse.Namespace(conf_file=str(config))
+    given: dict[str, Any] = dict(hyperparams=custom, env_kwargs=dict(n_tasks=10, n_uavs=2), config=str(config))
+    manager = UAVExperimentManager(args, "ppo", GENERIC, str(tmp_path), **given)
+    hyperparams, saved = manager.read_hyperparameters()
+    assert hyperparams["n_timesteps"] == saved["n_timesteps"] == 200
+    assert hyperparams["n_steps"] == custom.get("n_steps", 10) and hyperparams["env_kwargs"] == given["env_kwargs"]
 
 
 @pytest.mark.slow

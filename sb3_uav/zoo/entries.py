@@ -40,14 +40,14 @@ def scaled_values(
     :param entry: The entry
     :param name: Its name
     :param env_id: Id of the environment that uses it
-    :param env_kwargs: Arguments of the environment that do not come from the entry
+    :param env_kwargs: Arguments of the environment that replace those of the entry
     :return: The values that differ: ``n_timesteps`` for as many episodes, ``n_steps`` and ``batch_size`` for whole ones
     """
     if _level(env_id) != ALLOCATION_ID:
         return {}
     own = entry.get("env_kwargs")
     own = own if isinstance(own, dict) else {}
-    before, after = _size(name, own), _size(env_id, {**own, **(env_kwargs or {})})
+    before, after = _size(name, own), _size(env_id, env_kwargs or own)
     if before is None or after is None or before[1] == after[1]:
         return {}
     old, new = before[1], after[1]

@@ -85,8 +85,8 @@ class UAVExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         entry = self.env_name.gym_id
-        if str(self.config).endswith((".yml", ".yaml")):
-            entry = find_entry(read_yaml(Path(self.config)), entry, self.env_kwargs) or entry
+        found = read_yaml(Path(self.config)) if str(self.config).endswith((".yml", ".yaml")) else {}
+        entry = find_entry(found, entry, self.env_kwargs) or entry
         with self._reading(entry):
             hyperparams, saved = super().read_hyperparameters()
         if not isinstance(hyperparams, dict) or "n_timesteps" not in hyperparams:
@@ -94,7 +94,11 @@ class UAVExperimentManager(ExperimentManager):
         check_keys(set(hyperparams), rl_zoo3.ALGOS[self.algo], self._where)
         hyperparams = {key: plain_numbers(value) for key, value in hyperparams.items()}
         check_values(hyperparams, self._where)
-        scaled = scaled_values(hyperparams, entry, self.env_name.gym_id, self.env_kwargs)
+        # rl_zoo3 has replaced the entry's env_kwargs by those of the command line, but its numbers of steps are for its own:
+        # https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L368
+        read = found.get(entry, found.get("default"))
+        own = {**hyperparams, "env_kwargs": read.get("env_kwargs")} if isinstance(read, dict) else hyperparams
+        scaled = scaled_values(own, entry, self.env_name.gym_id, self.env_kwargs)
         for key, value in scaled.items():
             if key not in (self.custom_hyperparams or {}):
                 print(f"{key} is for another number of tasks: {hyperparams[key]} becomes {value}")
