@@ -5,14 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from its_runs import N_TASKS, SMALL, equal, learn, make_allocator, make_env, make_its, trace
 from stable_baselines3.common.callbacks import BaseCallback
 from tiny_zoo import ENV, EPOCH, NETWORK, entry, run, write_config
 
 from sb3_uav import pretrained
+from sb3_uav.envs import RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE, transfer
@@ -216,6 +219,24 @@ def test_shipped_pair_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert allocator.settings.mixed_precision and not allocator.settings.use_values
     assert run(tmp_path, config, "-i", "magic", "-n", str(EPOCH)) == 2
     assert "-i magic: no such file; give the zip of a trained agent, or one of ['universal']" in capsys.readouterr().err
+
+
+class OwnRoutes(RoutePlanningEnv):
+    """A router's environment of a user, whose name does not say so."""
+
+
+def test_the_zip_of_a_pair_is_that_of_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fault was the allocator's zip for a user's environment."""
+    from sb3_uav.zoo.fine_tuning import zip_of_pair
+
+    for env_id, entry_point in (("Fleet-v0", TaskAllocationEnv), ("Tours-v0", f"{__name__}:{OwnRoutes.__name__}")):
+        monkeypatch.setitem(gym.registry, env_id, EnvSpec(env_id, entry_point=entry_point))
+    allocator, router = pretrained.files()
+    for env_id in (ENV, "Fleet-v0", "CartPole-v1", None):
+        assert zip_of_pair("universal", env_id) == allocator
+    for env_id in ("RoutePlanning-N20-v0", "Tours-v0"):
+        assert zip_of_pair("universal", env_id) == router
+    assert zip_of_pair("no pair", ENV) is None
 
 
 @pytest.mark.slow

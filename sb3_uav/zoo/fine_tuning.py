@@ -14,6 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_uav import pretrained
+from sb3_uav.envs import RoutePlanningEnv
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.loading import StoredPolicy, read_policy
 from sb3_uav.reinforce import REINFORCE
@@ -22,6 +23,7 @@ from sb3_uav.training import ITSCallback, PretrainedRouterCallback
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, find_best_router
 from sb3_uav.training.its import ROUTER_FILE
 from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
+from sb3_uav.zoo.tuning import problem_env_class
 
 
 class Weights(NamedTuple):
@@ -44,8 +46,8 @@ def zip_of_pair(name: str, env_id: str | None) -> Path | None:
     """
     if name not in pretrained.names() or Path(name).is_file():
         return None
-    spec = None if env_id is None else gym.registry.get(env_id)
-    is_routing = spec is not None and str(spec.entry_point).endswith("RoutePlanningEnv")
+    env_class = problem_env_class(env_id) if env_id is not None and env_id in gym.registry else None
+    is_routing = env_class is not None and issubclass(env_class, RoutePlanningEnv)
     return pretrained.files(name)[1 if is_routing else 0]
 
 
