@@ -23,7 +23,7 @@ from sb3_uav.training.size_grid import _BEST_ALLOCATOR_FILE
 pytest.importorskip("rl_zoo3")
 from rl_zoo3.callbacks import TrialEvalCallback
 
-from sb3_uav.zoo.replay import _find_router
+from sb3_uav.zoo.checkpoints import find_router
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:SizeGridCallback is deprecated"),
@@ -75,7 +75,7 @@ def evaluating(names: tuple[str, ...], folder: Path) -> list[BaseCallback]:
 
 def instances_of_pair(folder: Path) -> tuple[int, int]:
     """How many instances allocator and router of the best pair have learned from, as ``enjoy --load-best`` finds them."""
-    router = _find_router(folder, folder / "best_model.zip", best=True)
+    router = find_router(folder / "best_model.zip")
     assert router is not None
     zips = [zipfile.ZipFile(path) for path in (folder / "best_model.zip", router)]
     data = [json.loads(file.read("data")) for file in zips]
@@ -177,7 +177,7 @@ def test_without_its_sb3_saves_its_own_best_model(tmp_path):
     stock = evaluation(tmp_path)
     make_allocator().learn(2 * 8 * N_TASKS, callback=stock)
     assert stock.best_model_save_path == str(tmp_path) and not (tmp_path / "best_pair.json").exists()
-    assert _find_router(tmp_path, tmp_path / "best_model.zip", best=True) is None
+    assert find_router(tmp_path / "best_model.zip") is None
 
 
 # ------------------------------------------------------------------------------------------ interruptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE, transfer
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
 
@@ -255,8 +256,35 @@ def test_routers_and_runs_without_its(pair: Path, tmp_path: Path, capsys: pytest
     assert f"weights of {pretrained.files()[1]}" in capsys.readouterr().out
     assert run(tmp_path, config, "-i", str(pair / "allocator.zip"), *flags) == 0
     assert (zoo_folder(tmp_path) / "router.zip").read_bytes() == (pair / "router.zip").read_bytes()
+    checkpoint = tmp_path / "rl_model_100_steps.zip"
+    for source, name in (("allocator", checkpoint.name), ("router", "router_100_steps.zip"), ("router", "router.zip")):
+        (tmp_path / name).write_bytes((pair / f"{source}.zip").read_bytes())
+    assert run(tmp_path, config, "-i", str(checkpoint), *flags) == 0
+    assert f"weights of {checkpoint} and the router {tmp_path / 'router_100_steps.zip'}" in capsys.readouterr().out
     assert run(tmp_path, config, "-i", str(pair / "router.zip"), *flags) == 2
     assert "needs a RoutePlanning environment, but this one is a TaskAllocation environment" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("folder", ["", CHECKPOINT_FOLDER])
+def test_the_router_of_an_allocators_zip(folder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The fault was the last router beside a checkpoint of --save-freq, in `-i` only."""
+    from sb3_uav.zoo.checkpoints import find_router
+
+    assert find_router(tmp_path / "any.zip") is None
+    last = tmp_path / folder / "router.zip"
+    last.parent.mkdir(exist_ok=True)
+    for path in (last, tmp_path / "router_100_steps.zip", tmp_path / "best_router.zip"):
+        path.touch()
+    if folder:
+        state = {"epoch": 1, "allocator": "allocator.zip", "router": "router.zip", "warm_started": True, "records": []}
+        (last.parent / STATE_FILE).write_text(json.dumps(state))
+        assert find_router(last.parent / "allocator.zip") == last
+    assert find_router(tmp_path / "rl_model_100_steps.zip") == tmp_path / "router_100_steps.zip"
+    assert find_router(tmp_path / "best_model.zip") == tmp_path / "best_router.zip"
+    assert find_router(tmp_path / "any.zip") == last
+    assert capsys.readouterr().out == ""
+    assert find_router(tmp_path / "rl_model_200_steps.zip") == last
+    assert "rl_model_200_steps.zip has no router of its own" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Checkpoints of ``--save-freq`` that hold both levels."""
+"""Checkpoints of ``--save-freq`` that hold both levels, and which router belongs to an allocator's zip."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.saving import save_atomically
-from sb3_uav.training.best_pair import RouterCallback
+from sb3_uav.training.best_pair import BEST_MODEL_FILE, RouterCallback, find_best_router
+from sb3_uav.training.its import ROUTER_FILE
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
 
 _MODEL_FILE = re.compile(r"rl_model_(\d+)_steps\.zip")
 
@@ -43,10 +45,36 @@ def _router_file(model: Path) -> str:
     return f"router_{model.stem.removeprefix('rl_model_')}.zip"
 
 
-def find_checkpoint_router(model: Path) -> Path | None:
+def find_checkpoint(trained_agent: Path) -> Path | None:
     """
-    :param model: Zip of an allocator
-    :return: The router of the same moment, if the zip is a checkpoint of ``--save-freq`` and has one
+    :param trained_agent: The allocator's zip
+    :return: The folder with the state of its interactive training, if there is one
     """
-    router = model.with_name(_router_file(model))
-    return router if _MODEL_FILE.fullmatch(model.name) and router.is_file() else None
+    beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
+    return next((folder for folder in (beside, below) if (folder / STATE_FILE).is_file()), None)
+
+
+def find_router(allocator: Path) -> Path | None:
+    """
+    :param allocator: The allocator's zip
+    :return: The zip of the router that it was trained with: that of the checkpoint of the ITS that it lies in; of the best
+        pair for the best model; of the same moment for a checkpoint of ``--save-freq``; else the run's last one; None if there
+        is none near it
+    """
+    folder = allocator.parent
+    if (folder / STATE_FILE).is_file():
+        return folder / read_state(folder)["router"]
+    is_checkpoint = _MODEL_FILE.fullmatch(allocator.name) is not None
+    own = find_best_router(folder) if allocator.name == BEST_MODEL_FILE else None
+    if is_checkpoint and (same_moment := allocator.with_name(_router_file(allocator))).is_file():
+        own = same_moment
+    if own is not None:
+        return own
+    last, checkpoint = folder / ROUTER_FILE, find_checkpoint(allocator)
+    if not last.is_file():
+        if checkpoint is None:
+            return None
+        last = checkpoint / read_state(checkpoint)["router"]
+    if is_checkpoint:
+        print(f"{allocator.name} has no router of its own: rewards come from the run's last one.")
+    return last

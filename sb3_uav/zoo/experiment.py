@@ -20,10 +20,10 @@ from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
-from sb3_uav.zoo.checkpoints import PairCheckpointCallback
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
-from sb3_uav.zoo.fine_tuning import Weights, find_checkpoint, start_from, weights_to_start_from
+from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
 from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 

@@ -20,9 +20,9 @@ from sb3_uav.policies.loading import StoredPolicy, read_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.any_size import fits
 from sb3_uav.training import ITSCallback, PretrainedRouterCallback
-from sb3_uav.training.best_pair import BEST_MODEL_FILE, find_best_router
 from sb3_uav.training.its import ROUTER_FILE
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE
+from sb3_uav.zoo.checkpoints import find_checkpoint, find_router
 from sb3_uav.zoo.tuning import problem_env_class
 
 
@@ -85,7 +85,7 @@ def weights_to_start_from(
     shipped = any(trained_agent.resolve() == file for name in pretrained.names() for file in pretrained.files(name))
     if same and not shipped and (not has_its or find_checkpoint(trained_agent) is not None):
         return None
-    router = _find_router(trained_agent) if is_allocator else None
+    router = find_router(trained_agent) if is_allocator else None
     if has_its and router is None and _needs_router(callbacks):
         beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
         raise FileNotFoundError(
@@ -120,31 +120,6 @@ def start_from(weights: Weights, hyperparams: dict[str, Any]) -> dict[str, Any]:
         its |= {"router": {"zip": router, **settings}, "n_pretraining_epochs": 0}
         its.pop("warm_start", None)
     return {**changed, "callback": callbacks}
-
-
-def find_checkpoint(trained_agent: Path) -> Path | None:
-    """
-    :param trained_agent: The allocator's zip
-    :return: The folder with the state of its interactive training, if there is one
-    """
-    beside, below = trained_agent.parent, trained_agent.parent / CHECKPOINT_FOLDER
-    return next((folder for folder in (beside, below) if (folder / STATE_FILE).is_file()), None)
-
-
-def _find_router(allocator: Path) -> Path | None:
-    """
-    :param allocator: The allocator's zip
-    :return: The zip of the router that it was trained with, if there is one near it
-    """
-    folder = allocator.parent
-    if (folder / STATE_FILE).is_file():
-        return folder / read_state(folder)["router"]
-    best = find_best_router(folder) if allocator.name == BEST_MODEL_FILE else None
-    beside = folder / ROUTER_FILE
-    if best is not None or beside.is_file():
-        return best or beside
-    checkpoint = find_checkpoint(allocator)
-    return None if checkpoint is None else checkpoint / read_state(checkpoint)["router"]
 
 
 def _argument_of(callbacks: Any, cls: type) -> dict[str, Any] | None:

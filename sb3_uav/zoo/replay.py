@@ -18,9 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.registration import ensure_registered
-from sb3_uav.training.best_pair import find_best_router
-from sb3_uav.training.its import ROUTER_FILE
-from sb3_uav.zoo.checkpoints import find_checkpoint_router
+from sb3_uav.zoo.checkpoints import find_router
 from sb3_uav.zoo.experiment import make_batched_vec_env
 from sb3_uav.zoo.saved import saved_env_kwargs
 from sb3_uav.zoo.trust import require_trust
@@ -75,25 +73,9 @@ def find_agent(chosen: argparse.Namespace, trust: bool) -> Agent:
     except AssertionError as error:
         # rl_zoo3 raises it for a missing folder.
         raise ValueError(str(error)) from error
-    agent = Agent(Path(model), _find_router(Path(run_folder), Path(model), chosen.load_best), Path(run_folder))
+    agent = Agent(Path(model), find_router(Path(model)), Path(run_folder))
     require_trust(agent.run_folder, trust)
     return agent
-
-
-def _find_router(run_folder: Path, model: Path, best: bool) -> Path | None:
-    """
-    :param run_folder: Folder of the allocator's zip
-    :param model: That zip
-    :param best: Whether it is that of the best pair
-    :return: The router's zip, if the run has one
-    """
-    found = find_best_router(run_folder) if best else find_checkpoint_router(model)
-    last = run_folder / ROUTER_FILE
-    if found is None and last.is_file():
-        found = last
-        if model.name.startswith("rl_model_"):
-            print(f"{model.name} has no router of its own: rewards come from the run's last one.")
-    return found
 
 
 def episode_length(agent: Agent, env_id: str) -> int | None:
