@@ -25,7 +25,8 @@ from sb3_uav.training import ITSCallback
 from sb3_uav.training.its_checkpoint import read_state
 
 pytest.importorskip("rl_zoo3")
-from tiny_zoo import ENV, EPOCH, its_with, run, write_config
+from test_policy_contracts import SUBCLASSES
+from tiny_zoo import ENV, EPOCH, NETWORK, its_with, run, write_config
 
 from sb3_uav.cli import main as cli
 from sb3_uav.studies.demo import evaluate_run, newest_run
@@ -110,6 +111,30 @@ def test_checkpoints_hold_the_router_of_their_moment(trained, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "rl_model_320_steps.zip has no router of its own: rewards come from the run's last one." in printed
     assert f"Rewards come from the router {copied / 'router.zip'}" in printed
+
+
+@pytest.mark.slow
+def test_enjoy_plays_policies_with_code_of_the_user(tmp_path, capsys, monkeypatch):
+    """The fault was an error for the router, and for the allocator tasks in the order of the input."""
+    networks = {
+        level: {**NETWORK, "features_extractor_class": f"{cls.__module__}.{cls.__name__}"} for level, cls in SUBCLASSES.items()
+    }
+    changes: dict[str, Any] = its_with(n_epochs=1, n_pretraining_epochs=0, n_intensive_epochs=0)
+    router = changes["callback"][0][ITS_KEY]["router"]
+    router |= dict(algo="ppo", policy_kwargs=networks["router"], batch_size=8, n_steps=4)
+    config = write_config(tmp_path, policy_kwargs=networks["allocator"], n_timesteps=EPOCH, **changes)
+    assert run(tmp_path, config, "--eval-freq", "-1") == 0
+    given: dict[str, Any] = {}
+
+    def spy(name: str) -> Any:
+        original = getattr(TaskAllocationEnv, name)
+        return lambda env, value: (given.update({name: value}), original(env, value))
+
+    for name in ("set_task_order", "set_router"):
+        monkeypatch.setattr(TaskAllocationEnv, name, spy(name))
+    assert enjoy.main(["--env", ENV, "-f", str(tmp_path / "logs"), "-n", "20", "--no-render"]) == 0
+    assert "1 Episodes" in capsys.readouterr().out and given["set_task_order"] == "sweep"
+    assert type(given["set_router"].__self__.features_extractor) is SUBCLASSES["router"]
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def weights_to_start_from(
         return None
     if not fits(stored, observation_space, action_space):
         return None
-    has_its = _argument_of(callbacks, ITSCallback) is not None
+    has_its = callback_arguments(callbacks, ITSCallback) is not None
     is_allocator = issubclass(stored.policy_class, AllocatorPolicy)
     same = _sizes(stored) in (None, _sizes_of(observation_space, action_space)) and _family(algorithm) == _family_of(stored)
     shipped = any(trained_agent.resolve() == file for name in pretrained.names() for file in pretrained.files(name))
@@ -110,9 +110,9 @@ def start_from(weights: Weights, hyperparams: dict[str, Any]) -> dict[str, Any]:
     given = changed.get("callback")
     callbacks = deepcopy(given if isinstance(given, list) else [given] if given else [])
     router = str(weights.router)
-    its = _argument_of(callbacks, ITSCallback)
+    its = callback_arguments(callbacks, ITSCallback)
     if its is None:
-        if _argument_of(callbacks, PretrainedRouterCallback) is None:
+        if callback_arguments(callbacks, PretrainedRouterCallback) is None:
             # First, because others may evaluate before the first update.
             callbacks.insert(0, {f"sb3_uav.training.{PretrainedRouterCallback.__name__}": {"router": router}})
     elif _needs_router(callbacks):
@@ -122,7 +122,7 @@ def start_from(weights: Weights, hyperparams: dict[str, Any]) -> dict[str, Any]:
     return {**changed, "callback": callbacks}
 
 
-def _argument_of(callbacks: Any, cls: type) -> dict[str, Any] | None:
+def callback_arguments(callbacks: Any, cls: type) -> dict[str, Any] | None:
     """
     :param callbacks: The ``callback`` of a YAML entry
     :param cls: The class of a callback
@@ -137,7 +137,7 @@ def _argument_of(callbacks: Any, cls: type) -> dict[str, Any] | None:
 
 def _needs_router(callbacks: Any) -> bool:
     """Whether the ``ITSCallback`` of an entry would train a router from scratch."""
-    router = (_argument_of(callbacks, ITSCallback) or {}).get("router")
+    router = (callback_arguments(callbacks, ITSCallback) or {}).get("router")
     return isinstance(router, dict) and not router.keys() & {"zip", "pretrained"}
 
 

@@ -162,21 +162,18 @@ def _evaluate(agent: Agent, args: argparse.Namespace, env_kwargs: dict[str, Any]
     """
     import numpy as np
     from huggingface_sb3 import EnvironmentName
-    from rl_zoo3 import ALGOS
     from rl_zoo3.utils import get_saved_hyperparams
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.utils import set_random_seed
 
     from sb3_uav.zoo.model_card import Results
-    from sb3_uav.zoo.replay import environment_of
+    from sb3_uav.zoo.replay import environment_of, load_model
 
     set_random_seed(args.seed)
     hyperparams, stats_path = get_saved_hyperparams(str(agent.run_folder / EnvironmentName(args.env)), test_mode=True)
     given = dict(n_envs=1, stats_path=stats_path, seed=args.seed, should_render=False, hyperparams=deepcopy(hyperparams))
     env = environment_of(agent)(args.env, **given, env_kwargs=env_kwargs)
-    # As rl_zoo3's commands do: https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/enjoy.py#L190
-    custom = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
-    model = ALGOS[args.algo].load(agent.model, custom_objects=custom, device=args.device)
+    model = load_model(args.algo, agent.model, args.device)
     successes: list[bool] = []
 
     def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -12,16 +11,23 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import create_test_env, get_model_path
+from rl_zoo3.utils import ALGOS, create_test_env, get_model_path
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
-from sb3_uav.policies.loading import load_policy
+from sb3_uav.policies.loading import NotOurPolicyError, load_policy
 from sb3_uav.registration import ensure_registered
+from sb3_uav.reinforce.algorithms import resolve_algorithm
+from sb3_uav.training import ITSCallback
 from sb3_uav.zoo.checkpoints import find_router
 from sb3_uav.zoo.experiment import make_batched_vec_env
-from sb3_uav.zoo.saved import saved_env_kwargs
+from sb3_uav.zoo.fine_tuning import callback_arguments
+from sb3_uav.zoo.saved import saved_callbacks, saved_env_kwargs
 from sb3_uav.zoo.trust import require_trust
+
+# That of ``ITSCallback`` where an entry names none.
+_ROUTER_ALGORITHM = "reinforce"
 
 
 class Agent(NamedTuple):
@@ -31,11 +37,13 @@ class Agent(NamedTuple):
     :param model: Its zip
     :param router: Zip of the router that gives its rewards; None if the run has none
     :param run_folder: Folder of its run
+    :param algo: rl_zoo3's name of its algorithm
     """
 
     model: Path
     router: Path | None
     run_folder: Path
+    algo: str
 
 
 def agent_parser(with_help: bool = True) -> argparse.ArgumentParser:
@@ -73,9 +81,8 @@ def find_agent(chosen: argparse.Namespace, trust: bool) -> Agent:
     except AssertionError as error:
         # rl_zoo3 raises it for a missing folder.
         raise ValueError(str(error)) from error
-    agent = Agent(Path(model), find_router(Path(model)), Path(run_folder))
-    require_trust(agent.run_folder, trust)
-    return agent
+    require_trust(Path(run_folder), trust)
+    return Agent(Path(model), find_router(Path(model)), Path(run_folder), chosen.algo)
 
 
 def episode_length(agent: Agent, env_id: str) -> int | None:
@@ -105,13 +112,45 @@ def _create_test_env(agent: Agent, env_id: str, **kwargs: Any) -> VecEnv:
     kwargs["vec_env_cls"] = make_batched_vec_env
     env: VecEnv = create_test_env(env_id, **kwargs)
     if env.has_attr("set_task_order"):
+        allocator: Any
+        try:
+            allocator = load_policy(agent.model, "cpu", AllocatorPolicy)
+        except NotOurPolicyError:
+            # The user's own code, or a stock policy. Whoever replays an agent unpickles it anyway.
+            allocator = load_model(agent.algo, agent.model, "cpu").policy
         # Stock policies define no order.
-        with suppress(ValueError):
-            env.env_method("set_task_order", load_policy(agent.model, "cpu", AllocatorPolicy).env_order)
+        if isinstance(allocator, AllocatorPolicy):
+            env.env_method("set_task_order", allocator.env_order)
     if agent.router is not None and env.has_attr("set_router"):
-        env.env_method("set_router", load_policy(agent.router, expected=RouterPolicy).plan)
+        router: Any
+        try:
+            router = load_policy(agent.router, expected=RouterPolicy)
+        except NotOurPolicyError:
+            router = load_model(_router_algorithm(agent.run_folder, EnvironmentName(env_id)), agent.router).policy
+        env.env_method("set_router", router.plan)
         print(f"Rewards come from the router {agent.router}")
     return env
+
+
+def load_model(algo: str, zip_file: Path, device: str = "auto") -> BaseAlgorithm:
+    """
+    Unpickle an agent, which runs any code in its zip.
+
+    :param algo: rl_zoo3's name of its algorithm, or a dotted path
+    :param zip_file: Its zip
+    :param device: Its device
+    :return: The agent, to be played only
+    """
+    # As rl_zoo3's commands do: https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/enjoy.py#L190
+    unused = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
+    algorithm = ALGOS[algo] if algo in ALGOS else resolve_algorithm(algo)
+    return algorithm.load(zip_file, device=device, custom_objects=unused)
+
+
+def _router_algorithm(run_folder: Path, env_name: str) -> str:
+    """:return: Name or dotted path of the algorithm of the router that a run has trained"""
+    settings = (callback_arguments(saved_callbacks(run_folder, env_name), ITSCallback) or {}).get("router")
+    return str(settings.get("algo", _ROUTER_ALGORITHM)) if isinstance(settings, dict) else _ROUTER_ALGORITHM
 
 
 def without_flag(arguments: Sequence[str], flag: str) -> tuple[list[str], bool]:

@@ -55,3 +55,14 @@ def saved_env_kwargs(run_folder: Path, env_name: str) -> dict[str, Any]:
     of_command = read_saved(arguments).get("env_kwargs") if arguments.is_file() else None
     # Those of the command line replace the others, as in the training.
     return of_command or of_yaml or {}
+
+
+def saved_callbacks(run_folder: Path, env_name: str) -> Any:
+    """
+    :param run_folder: Folder of a run
+    :param env_name: rl_zoo3's name of its environment
+    :return: The ``callback`` of its YAML entry
+    :raises ValueError: If the file cannot be read
+    """
+    config = run_folder / env_name / "config.yml"
+    return read_saved(config).get("callback") if config.is_file() else None
