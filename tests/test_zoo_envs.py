@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sb3_uav.envs import UniformGenerator
+from sb3_uav.envs import RoutePlanningEnv, UniformGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.registration import ensure_registered, size_of
 
@@ -271,3 +271,20 @@ def test_monitor_files_say_whether_episodes_succeed(tmp_path: Path) -> None:
     assert train_tiny(tmp_path, {env_id: settings}, env_id, "--eval-freq", "-1") == 0
     header = (tmp_path / "logs/reinforce/RoutePlanning-v0_2/0.monitor.csv").read_text().splitlines()[1]
     assert header == "r,l,t,objective,illegal_actions"
+
+
+class Rewarded(RoutePlanningEnv):
+    """An environment of a user with a reward of its own."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs, reward="zoo_hooks.plain_value")
+
+
+@pytest.mark.parametrize(("env_class", "kwargs"), [(RoutePlanningEnv, {"reward": "zoo_hooks.plain_value"}), (Rewarded, {})])
+def test_rewards_of_a_registered_id_train(env_class: Any, kwargs: dict[str, Any], tmp_path: Path) -> None:
+    """The fault was a KeyError at the end of the first episode, as the monitor looked for is_success."""
+    gym.register("Rewarded-v0", entry_point=env_class, kwargs={"n_tasks": 5, **kwargs})
+    settings = dict(policy="sb3_uav.policies.RouterPolicy", policy_kwargs=NETWORK, n_envs=2, n_timesteps=12)
+    assert train_tiny(tmp_path, {"Rewarded-v0": settings}, "Rewarded-v0", "--eval-freq", "-1") == 0
+    header, *rows = (tmp_path / "logs/reinforce/Rewarded-v0_1/0.monitor.csv").read_text().splitlines()[1:]
+    assert header == "r,l,t" and rows

@@ -173,7 +173,7 @@ class UAVExperimentManager(ExperimentManager):
         if given is not None:
             # Monitor joins it to a tuple.
             self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(given)}
-        elif has_success(self.env_name.gym_id) and not any("reward" in kw for kw in (self.env_kwargs, self.eval_env_kwargs)):
+        elif all(has_success(self.env_name.gym_id, kwargs) for kwargs in (self.env_kwargs, self.eval_env_kwargs)):
             self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": ("is_success",)}
 
     def _choose_eval_freq(self, hyperparams: dict[str, Any], callbacks: list[BaseCallback]) -> None:

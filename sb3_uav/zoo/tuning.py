@@ -175,13 +175,20 @@ def problem_env_class(env_id: str) -> type[ProblemEnv] | None:
     return creator if isinstance(creator, type) and issubclass(creator, ProblemEnv) else None
 
 
-def has_success(env_id: str) -> bool:
+def has_success(env_id: str, env_kwargs: _Params) -> bool:
     """
     :param env_id: Id of a registered environment
-    :return: Whether the last ``info`` of its episodes holds ``is_success``, unless it is made with a reward of the user
+    :param env_kwargs: Arguments that it is made with
+    :return: Whether the last ``info`` of its episodes holds ``is_success``, which it does not with a reward of the user
     """
     found = problem_env_class(env_id)
-    return found is not None and found.step is ProblemEnv.step
+    if found is None or found.step is not ProblemEnv.step:
+        return False
+    # The reward may come from the arguments, the registration or the constructor of a subclass.
+    env = gym.spec(env_id).make(**env_kwargs)
+    made: Any = env.unwrapped
+    env.close()
+    return made.problem.reward is None
 
 
 class StopWhenDiverged(BaseCallback):
