@@ -257,6 +257,30 @@ def test_the_model_card_says_how_to_use_it(logs: Path, here: Path, capsys: Any) 
     )
 
 
+@pytest.mark.parametrize("flags", [[], ["-name", "fleet"]])
+def test_the_commands_of_the_model_card_run(
+    flags: list[str], logs: Path, here: Path, hub: Hub, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also beside runs of the reader, which are the last ones then."""
+    assert cli.main([*PUSH, "-f", str(logs), *flags]) == 0
+    repository = hub.folder / "me" / (flags[1] if flags else f"reinforce-{ENV}")
+    body = (repository / "README.md").read_text()
+    runs = here / "logs" / "reinforce"
+    shutil.copytree(last_run(logs), runs / f"{ENV}_3")
+    TaskAllocationEnv(20, 3, 1.5).problem.generator(2, np.random.default_rng(0)).save(here / "my_instances.npz")
+    commands = re.findall(r"```bash\n(.*?)```", body, flags=re.DOTALL)[0].splitlines()
+    assert [command.split()[1] for command in commands] == ["load-from-hub", "evaluate", "enjoy"]
+    for command in commands:
+        name, *arguments = command.split()[1:]
+        small = {
+            "evaluate": [word for word in arguments if word != "ortools"],
+            "enjoy": [*arguments, "-n", "20", "--no-render"],
+        }
+        assert cli.main([name, *small.get(name, arguments)]) == 0, capsys.readouterr().err
+    assert (here / "results" / "results.csv").is_file()
+    assert f"Rewards come from the router {Path('logs') / 'reinforce' / f'{ENV}_1' / 'router.zip'}" in capsys.readouterr().out
+
+
 def test_the_hub_is_not_reached(here: Path, logs: Path, hub: Hub, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: Any, **kwargs: Any) -> None:
         raise RuntimeError("401 Unauthorized\nInvalid username or password.")

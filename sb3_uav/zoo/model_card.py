@@ -42,6 +42,7 @@ class Card(NamedTuple):
     :param env_id: Id of the environment
     :param env_kwargs: Arguments of the environment
     :param organization: Owner of the repository
+    :param repo_name: Its name; that of rl_zoo3 when None
     :param model_file: Name of the agent's zip
     :param has_router: Whether ``router.zip`` lies beside it
     :param has_video: Whether ``replay.mp4`` does
@@ -56,6 +57,7 @@ class Card(NamedTuple):
     env_id: str
     env_kwargs: dict[str, Any]
     organization: str
+    repo_name: str | None
     model_file: str
     has_router: bool
     has_video: bool
@@ -131,8 +133,11 @@ class Card(NamedTuple):
     def _commands(self) -> str:
         name = self.env_id.replace("/", "-")
         run = f"logs/{self.algo}/{name}_1"
-        load = f"sb3-uav load-from-hub --algo {self.algo} --env {self.env_id} -orga {self.organization} -f logs"
-        enjoy = f"sb3-uav enjoy --algo {self.algo} --env {self.env_id} -f logs --trust"
+        # The number in the paths below; load-from-hub says so if there is such a run already.
+        chosen = f"--algo {self.algo} --env {self.env_id} -f logs --exp-id 1"
+        repository = f"-orga {self.organization}" + (f" -name {self.repo_name}" if self.repo_name else "")
+        load = f"sb3-uav load-from-hub {chosen} {repository}"
+        enjoy = f"sb3-uav enjoy {chosen} --trust"
         solver = f"dl-drl:allocator={run}/{name}.zip,router={run}/router.zip"
         evaluate = f"sb3-uav evaluate --instances my_instances.npz --solvers {solver} ortools --out results"
         return "\n".join(["```bash", load, *([evaluate] if self.has_router else []), enjoy, "```"])

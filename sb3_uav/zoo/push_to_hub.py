@@ -132,6 +132,7 @@ def _write_repository(folder: Path, agent: Agent, args: argparse.Namespace) -> N
         args.env,
         env_kwargs,
         args.organization,
+        args.repo_name,
         model_file,
         agent.router is not None,
         not args.no_render,
