@@ -230,13 +230,11 @@ def test_the_zip_of_a_pair_is_that_of_the_level(monkeypatch: pytest.MonkeyPatch)
     """The fault was the allocator's zip for a user's environment."""
     from sb3_uav.zoo.fine_tuning import zip_of_pair
 
-    for env_id, entry_point in (("Fleet-v0", TaskAllocationEnv), ("Tours-v0", f"{__name__}:{OwnRoutes.__name__}")):
-        monkeypatch.setitem(gym.registry, env_id, EnvSpec(env_id, entry_point=entry_point))
+    for name, env_class in (("Fleet-v0", TaskAllocationEnv), ("Tours-v0", OwnRoutes)):
+        monkeypatch.setitem(gym.registry, name, EnvSpec(name, entry_point=f"{env_class.__module__}:{env_class.__name__}"))
     allocator, router = pretrained.files()
-    for env_id in (ENV, "Fleet-v0", "CartPole-v1", None):
-        assert zip_of_pair("universal", env_id) == allocator
-    for env_id in ("RoutePlanning-N20-v0", "Tours-v0"):
-        assert zip_of_pair("universal", env_id) == router
+    assert all(zip_of_pair("universal", env_id) == allocator for env_id in (ENV, "Fleet-v0", "CartPole-v1", None))
+    assert all(zip_of_pair("universal", env_id) == router for env_id in ("RoutePlanning-N20-v0", "Tours-v0"))
     assert zip_of_pair("no pair", ENV) is None
 
 
