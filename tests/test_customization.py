@@ -136,6 +136,20 @@ def test_a_reward_sees_the_order_of_the_visits() -> None:
     assert visits[-1] == 0 and rewards[-1] == visits[-2] - 1
 
 
+def test_a_reward_sees_the_whole_fleet() -> None:
+    """With more UAVs than tasks too: which UAV flies a tour may matter."""
+    shapes: list[tuple[int, ...]] = []
+
+    def last_uav(instances: Instances, tours: th.Tensor) -> th.Tensor:
+        shapes.append((instances.n_uavs, *tours.shape[:2]))
+        return (tours[:, -1] >= 0).sum(-1).double()
+
+    env = TaskAllocationEnv(3, 5, max_distance=9.0, reward=last_uav)
+    assert play(env, lambda env: 4)[0][-1] == 3 and play(env, lambda env: 3)[0][-1] == 0
+    assert shapes == [(5, 2, 5), (5, 1, 5), (5, 1, 5)]
+    assert env.problem.returns(env.instance, th.tensor([[[4, 0, 4]]])).tolist() == [[2.0]]
+
+
 @pytest.mark.parametrize(("env_id", "policy"), [(ALLOCATION, "AllocatorPolicy"), (ROUTING, "RouterPolicy")])
 @pytest.mark.parametrize("vec_env", [BatchedVecEnv, DummyVecEnv])
 def test_both_drivers_give_the_same_reward(env_id: str, policy: str, vec_env: type) -> None:

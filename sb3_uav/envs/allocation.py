@@ -183,9 +183,10 @@ def _planned_value(instances: Instances, assignment: th.Tensor, router: Router, 
     :param reward: Values the tours; the total value of the tasks on them when None
     :return: ``(batch, n_samples)`` float64
     """
-    instances, assignment = _useful_allocation(instances, assignment)
-    planned = plan_tours(instances, assignment, router)
-    return planned.value if reward is None else score_tours(reward, instances, planned.tours)
+    if reward is not None:
+        # It may depend on which UAV flies a tour, and on how many there are.
+        return score_tours(reward, instances, plan_tours(instances, assignment, router).tours)
+    return plan_tours(*_useful_allocation(instances, assignment), router).value
 
 
 def _alternating(instances: Instances) -> th.Tensor:
