@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import random
 import re
 from pathlib import Path
@@ -174,6 +176,27 @@ def test_both_drivers_give_the_same_reward(env_id: str, policy: str, vec_env: ty
         assert played == rewards[row, 0, :step].tolist()
     model.learn(1)
     assert model.n_batches == 1
+
+
+def test_objects_of_the_same_class_and_arguments_are_equal() -> None:
+    """So that REINFORCE's fused driver recognizes the rows of a DummyVecEnv as the same environment."""
+    kwargs: dict[str, Any] = dict(
+        generator={"zoo_hooks.PlainCorner": {"side": 0.5}},
+        reward={"zoo_hooks.PowerOfVisits": {"power": 2}},
+        router="zoo_hooks.NearestRouter",
+    )
+    env = DummyVecEnv([lambda: make(**kwargs)] * 2)
+    first, second = env.get_attr("problem")
+    assert (first.generator, first.reward, first.router) == (second.generator, second.reward, second.router)
+    assert hash(first.generator) == hash(second.generator) and first.generator.side == 0.5
+    assert copy.deepcopy(first.reward) == pickle.loads(pickle.dumps(first.reward)) == first.reward
+    model = REINFORCE("AllocatorPolicy", env, policy_kwargs=NETWORK, seed=0, device="cpu")
+    assert model.problem is first
+    assert play(make(reward="zoo_hooks.PowerOfVisits"), first_legal) == play(
+        make(reward="zoo_hooks.root_of_visits"), first_legal
+    )
+    others = make(generator="zoo_hooks.PlainCorner", reward="zoo_hooks.PowerOfVisits").problem
+    assert first.generator != others.generator and first.reward != others.reward
 
 
 def test_trying_out_disturbs_no_random_stream() -> None:

@@ -62,6 +62,30 @@ class _Call:
 
 
 @dataclass(frozen=True)
+class _Made:
+    """
+    An object of a class without an equality of its own; equal to another that was made in the same way.
+
+    :param factory: What made it
+    :param arguments: Keyword arguments of the factory
+    :param made: The object, whose attributes are found here too
+    """
+
+    factory: Callable[..., Any]
+    arguments: dict[str, Any] = field(hash=False)
+    made: Any = field(compare=False)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.made(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        # Python asks a copy in the making for some of these, which has no object yet.
+        if name.startswith("__") or name == "made":
+            raise AttributeError(name)
+        return getattr(self.made, name)
+
+
+@dataclass(frozen=True)
 class _FunctionGenerator:
     """
     Instances from a distribution of the user.
@@ -133,10 +157,13 @@ def _function(argument: str, given: Any, what: str) -> Callable[..., Any]:
 
 
 def _made(argument: str, given: Any, factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """:return: What the factory makes, equal to whatever it makes with equal arguments"""
     try:
-        return factory(**arguments)
+        made = factory(**arguments)
     except Exception as error:
         raise _refusal(argument, given, f"could not be made with {arguments} ({type(error).__name__}: {error}).") from error
+    is_plain = callable(made) and type(made).__eq__ is object.__eq__
+    return _Made(factory, arguments, made) if is_plain else made
 
 
 # ------------------------------------------------------------------------------------------------------------ instances
