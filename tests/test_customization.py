@@ -6,6 +6,7 @@ import copy
 import pickle
 import random
 import re
+import types
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,36 @@ def test_generators_may_draw_fewer_tasks_than_they_have_slots_for() -> None:
     env = make(generator=Fewer(20, 3))
     env.reset(seed=0)
     assert env.instance.task_mask.sum().item() == 17 and env.instance.n_tasks == 20
+
+
+def test_a_generator_replaces_the_distribution_of_an_id() -> None:
+    env_id = "TaskAllocation-Universal-v0"
+    instance = first_instance(env_id=env_id, generator={"zoo_hooks.Corner": {"n_tasks": 9}})
+    assert (instance.n_tasks, instance.n_uavs) == (9, 8) and instance.depot.tolist() == [[0.0, 0.0]]
+    assert make(env_id, generator=zoo_hooks.Corner(20, 3, 1.5)).observation_space == make().observation_space
+
+
+def test_nothing_is_drawn_from_an_object_before_the_first_episode() -> None:
+    """One that takes its instances from a list, say, would skip the first ones."""
+
+    class Queue(UniformGenerator):
+        n_drawn = 0
+
+        def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+            type(self).n_drawn += batch_size
+            return super().__call__(batch_size, rng)
+
+    env = make(generator=Queue(20, 3), router="zoo_hooks.one_task", reward="zoo_hooks.root_of_visits")
+    alone = make(ROUTING, generator=Queue(20, 1), reward="zoo_hooks.root_of_visits")
+    assert Queue.n_drawn == 0
+    env.reset(seed=0)
+    alone.reset(seed=0)
+    assert Queue.n_drawn == 2
+    with pytest.raises(ValueError, match=r"its n_tasks is 0; it needs a whole number"):
+        make(generator=types.SimpleNamespace(n_tasks=0, n_uavs=3))
+    # Those of the package have no state.
+    with pytest.raises(ValueError, match=r"^reward is 'zoo_hooks\.broken': it failed"):
+        make(generator=UniformGenerator(20, 3), reward="zoo_hooks.broken")
 
 
 def test_distributions_draw_points_and_values() -> None:
@@ -290,7 +321,7 @@ def test_contradictions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="generator and instances both say what to draw; give one of them"):
         make(generator="zoo_hooks.Corner", instances=path)
     with pytest.raises(ValueError, match="generator and distribution both say what to draw"):
-        make(generator="zoo_hooks.Corner", distribution="clustered")
+        make(generator="zoo_hooks.Corner", distribution="zoo_hooks.stripe")
     with pytest.raises(ValueError, match="instances and distribution both say what to draw"):
         make(instances=path, distribution="zoo_hooks.stripe")
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_uav.envs.customization import make_reward, make_router, make_source, try_reward, try_router
+from sb3_uav.envs.customization import is_drawable, make_reward, make_router, make_source, try_reward, try_router
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
@@ -334,9 +334,10 @@ class TaskAllocationEnv(ProblemEnv):
         source = make_source(n_tasks, n_uavs, max_distance, distribution, instances, generator)
         planner = make_router(router)
         problem = AllocationProblem(source, planner, task_order, make_reward(reward))
-        if planner is not None:
+        can_try = is_drawable(generator, source)
+        if planner is not None and can_try:
             try_router(router, planner, _subsets_to_try, source)
-        if problem.reward is not None:
+        if problem.reward is not None and can_try:
             try_reward(reward, lambda drawn: problem.returns(drawn, _alternating(drawn)), source)
         super().__init__(problem, render_mode)
 
