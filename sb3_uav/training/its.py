@@ -16,7 +16,6 @@ from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, M
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
-from sb3_uav.common.router_progress import router_progress
 from sb3_uav.common.sb3_compat import n_updates, total_timesteps
 from sb3_uav.common.shared_axis import SharedAxis
 from sb3_uav.envs.allocation import AllocationProblem
@@ -39,6 +38,7 @@ from sb3_uav.training.its_checkpoint import (
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
 from sb3_uav.training.router_handover import hand_over_router
+from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import find_run_folder
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_large_batches
