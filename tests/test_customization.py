@@ -269,9 +269,9 @@ DISTRIBUTIONS = [
 ROUTERS = [
     (
         "nowhere",
-        "there is no trained pair of this name; there are universal; give a zip, the name of a pair",
+        "router: nowhere: no such file; give the zip of a router that was trained before, or one of ['universal']. Or give",
     ),
-    ("nowhere.zip", "nowhere.zip: no such file; give a zip, the name of a pair, or a dotted path."),
+    ("nowhere.zip", "nowhere.zip: no such file; give the zip of a router"),
     ("zoo_hooks.nowhere", "cannot be imported"),
     ("zoo_hooks.flat", "it returned torch.int64 of shape"),
     ("zoo_hooks.floats", "it returned torch.float64 of shape"),

@@ -285,7 +285,7 @@ def make_router(router: Any) -> Callable[[Instances], th.Tensor] | None:
         try:
             found: Callable[[Instances], th.Tensor] = offered("load_router")(router)
         except (ValueError, OSError) as error:
-            raise _refusal("router", router, f"{error}; give a zip, the name of a pair, or a dotted path.") from error
+            raise _refusal("router", router, f"{error} Or give the dotted path of a function.") from error
         return found
     return None if router is None else _function("router", router, "function(instances)")
 
