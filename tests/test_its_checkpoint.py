@@ -190,6 +190,8 @@ RECORD: dict[str, Any] = dict(epoch=1, level="router", phase="alternate", n_inst
         (json.dumps({**INTACT, "router": 5}), "router is 5, not the name of a zip"),
         (json.dumps({**INTACT, "allocator": "../other/model.zip"}), "allocator is '../other/model.zip', not the name"),
         (json.dumps({**INTACT, "warm_started": "yes"}), "warm_started is 'yes'"),
+        (json.dumps({**INTACT, "share": 0}), "share is 0"),
+        (json.dumps({**INTACT, "share": "half"}), "share is 'half'"),
         (json.dumps({**INTACT, "records": {"epoch": 1}}), "records is {'epoch': 1}"),
         (json.dumps({**INTACT, "records": [1]}), "record 0 is 1"),
         (json.dumps({**INTACT, "records": [RECORD, dict(epoch=1)]}), "record 1 is {'epoch': 1}"),

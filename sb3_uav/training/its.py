@@ -175,7 +175,6 @@ class ITSCallback(RouterCallback):
             # Before anything is drawn or saved, so that an unseeded run draws a seed and every zip of it has that seed.
             self._seed()
             warn_of_large_batches(self.model, self.instances_per_epoch, self.problem.generator.n_tasks)
-            self._share = share_of_plan(self.model, self.n_epochs, self.instances_per_epoch, self.problem.generator.n_tasks)
             self._set_up_router()
             self._started = True
         # SB3's algorithms only count steps, which may start again from 0, so instances are counted from here.
@@ -209,14 +208,18 @@ class ITSCallback(RouterCallback):
         self._allocator_freezer = Freezer(self.model.policy)
         if self.resume_from is None:
             self.resume_from = noted_checkpoint(self.model)
+        share: float | None = None
         if self.resume_from is not None:
-            self._resume(self.resume_from)
+            share = self._resume(self.resume_from)
         elif n_updates(self.model) > 0:
             raise ValueError(
                 "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
                 f"{CHECKPOINT_FOLDER} folder of the earlier run, or start a new one with its weights "
                 "(sb3_uav.reinforce.transfer.load) and a router that was trained before."
             )
+        if share is None:
+            share = share_of_plan(self.model, self.n_epochs, self.instances_per_epoch, self.problem.generator.n_tasks)
+        self._share = share
         self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
             self._start_router(self.warm_start)
@@ -427,9 +430,10 @@ class ITSCallback(RouterCallback):
         self._save_router()
         if self.save_path is not None:
             folder = self.save_path / CHECKPOINT_FOLDER
-            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, self._warm_started)
+            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, self._warm_started, self._share)
 
-    def _resume(self, folder: Path) -> None:
+    def _resume(self, folder: Path) -> float | None:
+        """:return: The share of the plan with which the run began, unless an older version wrote the checkpoint"""
         state = read_state(folder)
         check_allocator(folder, state, self.model)
         self.epoch = state["epoch"]
@@ -437,3 +441,4 @@ class ITSCallback(RouterCallback):
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         self._trainer.load(folder / state["router"])
+        return state.get("share")

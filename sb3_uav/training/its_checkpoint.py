@@ -31,6 +31,7 @@ def write_checkpoint(
     epoch: int,
     records: Sequence[EpochRecord],
     warm_started: bool,
+    share: float,
 ) -> None:
     """
     Write both zips and the state of the strategy.
@@ -43,6 +44,7 @@ def write_checkpoint(
     :param epoch: Finished epochs of the allocator
     :param records: The epochs of both levels so far
     :param warm_started: Whether the router's warm start, if there is one, is over
+    :param share: The part of the planned steps to which warm start and pre-training were cut
     :raises OSError: If a file cannot be written
     """
     # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
@@ -53,7 +55,8 @@ def write_checkpoint(
     names = {"allocator": f"allocator_{epoch}.zip", "router": f"router_{number}.zip"}
     save_atomically(allocator, folder / names["allocator"])
     save_atomically(router, folder / names["router"])
-    state = {"epoch": epoch, **names, "warm_started": warm_started, "records": [asdict(record) for record in records]}
+    state = {"epoch": epoch, **names, "warm_started": warm_started, "share": share}
+    state["records"] = [asdict(record) for record in records]
     write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
     for old in folder.iterdir():
         if re.fullmatch(r"(allocator|router)_(\d+|start)\.zip", old.name) and old.name not in names.values():
@@ -83,7 +86,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     """
     :param folder: A checkpoint of :class:`~sb3_uav.training.ITSCallback`
     :return: The contents of its state file: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``, and,
-        unless an older version wrote it, ``warm_started``
+        unless an older version wrote it, ``warm_started`` and ``share``
     :raises FileNotFoundError: If there is none
     :raises ValueError: If it is damaged
     """
@@ -106,6 +109,9 @@ def read_state(folder: Path) -> dict[str, Any]:
             raise _damaged(path, f"{level} is {state[level]!r:.40}, not the name of a zip")
     if not isinstance(state.get("warm_started", True), bool):
         raise _damaged(path, f"warm_started is {state['warm_started']!r:.40}")
+    share = state.get("share", 1.0)
+    if not isinstance(share, int | float) or isinstance(share, bool) or not 0 < share <= 1:
+        raise _damaged(path, f"share is {share!r:.40}")
     if not isinstance(state["records"], list):
         raise _damaged(path, f"records is {state['records']!r:.40}")
     for number, record in enumerate(state["records"]):
