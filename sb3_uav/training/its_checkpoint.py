@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,8 +13,10 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_uav.common.epoch_log import EpochRecord
-from sb3_uav.common.files import write_atomically
+from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.sb3_compat import n_updates
+from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.reinforce import REINFORCE
 
 CHECKPOINT_FOLDER = "its_checkpoint"
@@ -32,6 +35,7 @@ def write_checkpoint(
     records: Sequence[EpochRecord],
     warm_started: bool,
     share: float,
+    origin: str | None,
 ) -> None:
     """
     Write both zips and the state of the strategy.
@@ -45,11 +49,13 @@ def write_checkpoint(
     :param records: The epochs of both levels so far
     :param warm_started: Whether the router's warm start, if there is one, is over
     :param share: The part of the planned steps to which warm start and pre-training were cut
+    :param origin: What the run started from, see :func:`origin_of`
     :raises OSError: If a file cannot be written
     """
     # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
     n_instances = getattr(allocator, "n_instances", None)
-    setattr(allocator, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances})
+    noted = {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances, "origin": origin}
+    setattr(allocator, CHECKPOINT, noted)
     # Another name before the warm start, because a zip that the state file names must not change.
     number = str(n_router_epochs(records)) if warm_started else "start"
     names = {"allocator": f"allocator_{epoch}.zip", "router": f"router_{number}.zip"}
@@ -71,15 +77,55 @@ def n_router_epochs(records: Sequence[EpochRecord]) -> int:
     return sum(record.level == "router" for record in records)
 
 
-def noted_checkpoint(allocator: BaseAlgorithm) -> Path | None:
+def origin_of(router: Path | None, generator: InstanceGenerator) -> str | None:
+    """
+    :param router: Zip of the router that a run is given to start from
+    :param generator: Draws the instances of the fleet
+    :return: What tells the run from one with another router or of another size; None without such a router
+    """
+    return None if router is None else f"{file_hash(router)} {generator.n_uavs} {generator.n_tasks}"
+
+
+def noted_checkpoint(allocator: BaseAlgorithm, origin: str | None) -> Path | None:
     """
     :param allocator: An allocator that was loaded from a zip
-    :return: The checkpoint that it belongs to, if it is still where it was written
+    :param origin: What the run is given to start from; None if it has no router yet
+    :return: The checkpoint that it belongs to, if it is still where it was written, and of a run with the same origin if there
+        is one: with the router of another run, a new one starts
     """
     noted = getattr(allocator, CHECKPOINT, None)
     if not isinstance(noted, dict) or not (Path(str(noted.get("folder"))) / STATE_FILE).is_file():
         return None
+    if origin is not None and noted.get("origin") != origin:
+        return None
     return Path(noted["folder"])
+
+
+def begin_anew(allocator: BaseAlgorithm, router: Path | None) -> None:
+    """
+    Let an allocator forget how far an earlier run has come. Weights, optimizer and random streams go on.
+
+    :param allocator: The allocator's algorithm
+    :param router: Zip of the router that the new run starts from
+    :raises ValueError: If the allocator was trained before, and there is no such router
+    """
+    if n_updates(allocator) > 0:
+        if router is None:
+            raise ValueError(
+                "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
+                f"{CHECKPOINT_FOLDER} folder of the earlier run, or router to the zip of a router, to start a new run with "
+                "both."
+            )
+        warnings.warn(
+            f"The allocator has been trained before: a new run starts at epoch 0 with it and the router {router}. To go on "
+            f"with an earlier run of ITSCallback, set resume_from to its {CHECKPOINT_FOLDER} folder.",
+            stacklevel=4,
+        )
+    vars(allocator).pop(CHECKPOINT, None)
+    if isinstance(allocator, REINFORCE):
+        if allocator.max_instances is not None:
+            allocator.max_instances -= allocator.n_instances
+        allocator.n_instances = allocator.epoch = 0
 
 
 def read_state(folder: Path) -> dict[str, Any]:
