@@ -221,13 +221,13 @@ def test_objects_of_the_same_class_and_arguments_are_equal() -> None:
     assert (first.generator, first.reward, first.router) == (second.generator, second.reward, second.router)
     assert hash(first.generator) == hash(second.generator) and first.generator.side == 0.5
     assert copy.deepcopy(first.reward) == pickle.loads(pickle.dumps(first.reward)) == first.reward
+    others = make(generator="zoo_hooks.PlainCorner", reward="zoo_hooks.PowerOfVisits").problem
+    assert first.generator != others.generator and first.reward != others.reward
     model = REINFORCE("AllocatorPolicy", env, policy_kwargs=NETWORK, seed=0, device="cpu")
     assert model.problem is first
     assert play(make(reward="zoo_hooks.PowerOfVisits"), first_legal) == play(
         make(reward="zoo_hooks.root_of_visits"), first_legal
     )
-    others = make(generator="zoo_hooks.PlainCorner", reward="zoo_hooks.PowerOfVisits").problem
-    assert first.generator != others.generator and first.reward != others.reward
 
 
 def test_trying_out_disturbs_no_random_stream() -> None:

@@ -171,8 +171,8 @@ def _made(argument: str, given: Any, factory: Callable[..., Any], arguments: dic
         made = factory(**arguments)
     except Exception as error:
         raise _refusal(argument, given, f"could not be made with {arguments} ({type(error).__name__}: {error}).") from error
-    is_plain = callable(made) and type(made).__eq__ is object.__eq__
-    return _Made(factory, arguments, made) if is_plain else made
+    equality: Any = type(made).__eq__
+    return _Made(factory, arguments, made) if callable(made) and equality is object.__eq__ else made
 
 
 # ------------------------------------------------------------------------------------------------------------ instances
