@@ -78,6 +78,7 @@ RULES = [
     Rule("README.md", r"-f logs\n", "-f logs --no-render -n 80\n"),
     Rule("README.md", r"--samples 128", "--samples 4"),
     Rule("docs/training.md", r"n_envs=64", "n_envs=4"),
+    Rule("docs/training.md", r"(sb3-uav train .*?-U4-N80-v0)", rf"\1 {_SMALL.format('reinforce')}"),
     Rule("docs/training.md", r"batch_size=640", "batch_size=160"),
     Rule("docs/training.md", r"300_000", "320"),
     Rule("docs/training.md", r"n_envs: 64", "n_envs: 4"),

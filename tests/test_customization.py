@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import random
 import re
+import types
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +81,36 @@ def test_generators_may_draw_fewer_tasks_than_they_have_slots_for() -> None:
     assert env.instance.task_mask.sum().item() == 17 and env.instance.n_tasks == 20
 
 
+def test_a_generator_replaces_the_distribution_of_an_id() -> None:
+    env_id = "TaskAllocation-Universal-v0"
+    instance = first_instance(env_id=env_id, generator={"zoo_hooks.Corner": {"n_tasks": 9}})
+    assert (instance.n_tasks, instance.n_uavs) == (9, 8) and instance.depot.tolist() == [[0.0, 0.0]]
+    assert make(env_id, generator=zoo_hooks.Corner(20, 3, 1.5)).observation_space == make().observation_space
+
+
+def test_nothing_is_drawn_from_an_object_before_the_first_episode() -> None:
+    """One that takes its instances from a list, say, would skip the first ones."""
+
+    class Queue(UniformGenerator):
+        n_drawn = 0
+
+        def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+            type(self).n_drawn += batch_size
+            return super().__call__(batch_size, rng)
+
+    env = make(generator=Queue(20, 3), router="zoo_hooks.one_task", reward="zoo_hooks.root_of_visits")
+    alone = make(ROUTING, generator=Queue(20, 1), reward="zoo_hooks.root_of_visits")
+    assert Queue.n_drawn == 0
+    env.reset(seed=0)
+    alone.reset(seed=0)
+    assert Queue.n_drawn == 2
+    with pytest.raises(ValueError, match=r"its n_tasks is 0; it needs a whole number"):
+        make(generator=types.SimpleNamespace(n_tasks=0, n_uavs=3))
+    # Those of the package have no state.
+    with pytest.raises(ValueError, match=r"^reward is 'zoo_hooks\.broken': it failed"):
+        make(generator=UniformGenerator(20, 3), reward="zoo_hooks.broken")
+
+
 def test_distributions_draw_points_and_values() -> None:
     plain = first_instance(distribution="zoo_hooks.stripe")
     assert plain.tasks[..., 0].max() <= 0.1 < plain.tasks[..., 1].max() and (plain.values == 1).all()
@@ -136,6 +169,20 @@ def test_a_reward_sees_the_order_of_the_visits() -> None:
     assert visits[-1] == 0 and rewards[-1] == visits[-2] - 1
 
 
+def test_a_reward_sees_the_whole_fleet() -> None:
+    """With more UAVs than tasks too: which UAV flies a tour may matter."""
+    shapes: list[tuple[int, ...]] = []
+
+    def last_uav(instances: Instances, tours: th.Tensor) -> th.Tensor:
+        shapes.append((instances.n_uavs, *tours.shape[:2]))
+        return (tours[:, -1] >= 0).sum(-1).double()
+
+    env = TaskAllocationEnv(3, 5, max_distance=9.0, reward=last_uav)
+    assert play(env, lambda env: 4)[0][-1] == 3 and play(env, lambda env: 3)[0][-1] == 0
+    assert shapes == [(5, 2, 5), (5, 1, 5), (5, 1, 5)]
+    assert env.problem.returns(env.instance, th.tensor([[[4, 0, 4]]])).tolist() == [[2.0]]
+
+
 @pytest.mark.parametrize(("env_id", "policy"), [(ALLOCATION, "AllocatorPolicy"), (ROUTING, "RouterPolicy")])
 @pytest.mark.parametrize("vec_env", [BatchedVecEnv, DummyVecEnv])
 def test_both_drivers_give_the_same_reward(env_id: str, policy: str, vec_env: type) -> None:
@@ -160,6 +207,27 @@ def test_both_drivers_give_the_same_reward(env_id: str, policy: str, vec_env: ty
         assert played == rewards[row, 0, :step].tolist()
     model.learn(1)
     assert model.n_batches == 1
+
+
+def test_objects_of_the_same_class_and_arguments_are_equal() -> None:
+    """So that REINFORCE's fused driver recognizes the rows of a DummyVecEnv as the same environment."""
+    kwargs: dict[str, Any] = dict(
+        generator={"zoo_hooks.PlainCorner": {"side": 0.5}},
+        reward={"zoo_hooks.PowerOfVisits": {"power": 2}},
+        router="zoo_hooks.NearestRouter",
+    )
+    env = DummyVecEnv([lambda: make(**kwargs)] * 2)
+    first, second = env.get_attr("problem")
+    assert (first.generator, first.reward, first.router) == (second.generator, second.reward, second.router)
+    assert hash(first.generator) == hash(second.generator) and first.generator.side == 0.5
+    assert copy.deepcopy(first.reward) == pickle.loads(pickle.dumps(first.reward)) == first.reward
+    others = make(generator="zoo_hooks.PlainCorner", reward="zoo_hooks.PowerOfVisits").problem
+    assert first.generator != others.generator and first.reward != others.reward
+    model = REINFORCE("AllocatorPolicy", env, policy_kwargs=NETWORK, seed=0, device="cpu")
+    assert model.problem is first
+    assert play(make(reward="zoo_hooks.PowerOfVisits"), first_legal) == play(
+        make(reward="zoo_hooks.root_of_visits"), first_legal
+    )
 
 
 def test_trying_out_disturbs_no_random_stream() -> None:
@@ -201,9 +269,9 @@ DISTRIBUTIONS = [
 ROUTERS = [
     (
         "nowhere",
-        "there is no trained pair of this name; there are universal; give a zip, the name of a pair",
+        "router: nowhere: no such file; give the zip of a router that was trained before, or one of ['universal']. Or give",
     ),
-    ("nowhere.zip", "nowhere.zip: no such file; give a zip, the name of a pair, or a dotted path."),
+    ("nowhere.zip", "nowhere.zip: no such file; give the zip of a router"),
     ("zoo_hooks.nowhere", "cannot be imported"),
     ("zoo_hooks.flat", "it returned torch.int64 of shape"),
     ("zoo_hooks.floats", "it returned torch.float64 of shape"),
@@ -253,7 +321,7 @@ def test_contradictions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="generator and instances both say what to draw; give one of them"):
         make(generator="zoo_hooks.Corner", instances=path)
     with pytest.raises(ValueError, match="generator and distribution both say what to draw"):
-        make(generator="zoo_hooks.Corner", distribution="clustered")
+        make(generator="zoo_hooks.Corner", distribution="zoo_hooks.stripe")
     with pytest.raises(ValueError, match="instances and distribution both say what to draw"):
         make(instances=path, distribution="zoo_hooks.stripe")
 

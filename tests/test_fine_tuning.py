@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from sb3_uav.policies.loading import load_policy
 from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE, transfer
 from sb3_uav.training import ITSCallback
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT, CHECKPOINT_FOLDER, STATE_FILE, read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:ITSCallback saves no router")
 
@@ -101,6 +103,47 @@ def test_warm_start_of_a_given_router_when_asked_for(pair: Path) -> None:
     assert equal(expected, its.router.policy.state_dict()) and not equal(given, expected)
 
 
+@pytest.mark.parametrize("reset", [True, False])
+@pytest.mark.parametrize("n_uavs", [2, 3])
+def test_trained_allocator_with_a_given_router_starts_anew(n_uavs: int, reset: bool, pair: Path, tmp_path: Path) -> None:
+    """Its zip names the checkpoint of the finished run, which a router of another run or size does not continue."""
+    model = REINFORCE.load(pair / "allocator.zip", env=make_env(n_uavs=n_uavs), device="cpu")
+    assert model.n_instances == 8 and getattr(model, CHECKPOINT)["folder"] == str((pair / CHECKPOINT_FOLDER).resolve())
+    kwargs: dict[str, Any] = dict(n_epochs=2, strategy="alternate-only", save_path=str(tmp_path))
+    its = ITSCallback("universal", **kwargs)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    new_run = rf"a new run starts at epoch 0 with it and the router {re.escape(str(pretrained.files()[1]))}\. To go on"
+    with warnings.catch_warnings(), pytest.warns(UserWarning, match=new_run):
+        warnings.filterwarnings("error", message="This run has")
+        model.learn(16 * N_TASKS, callback=its, reset_num_timesteps=reset)
+    assert trace(its) == "atat" and [record.n_instances for record in its.records] == [8] * 4
+    assert (its.epoch, model.epoch, model.n_instances) == (2, 2, 16) and not equal(before, model.policy.state_dict())
+    shipped = load_policy(pretrained.files()[1], "cpu").state_dict()
+    assert shipped.keys() == its.router.policy.state_dict().keys()
+
+    # That of the same router and size is continued, as by stock rl_zoo3, which tells callbacks nothing.
+    folder = tmp_path / CHECKPOINT_FOLDER
+    state = read_state(folder)
+    again = REINFORCE.load(folder / state["allocator"], env=make_env(n_uavs=n_uavs), device="cpu")
+    longer = ITSCallback("universal", **{**kwargs, "n_epochs": 3})
+    again.learn(8 * N_TASKS, callback=longer, reset_num_timesteps=False)
+    assert trace(longer) == "atatat" and longer.resume_from == folder
+    # But not on another size.
+    other = REINFORCE.load(folder / read_state(folder)["allocator"], env=make_env(n_uavs=5 - n_uavs), device="cpu")
+    fresh = ITSCallback("universal", **{**kwargs, "n_epochs": 1, "save_path": None})
+    with pytest.warns(UserWarning, match=new_run):
+        other.learn(8 * N_TASKS, callback=fresh)
+    assert trace(fresh) == "at" and fresh.resume_from is None
+
+
+@pytest.mark.filterwarnings("ignore:The allocator has been trained before")
+def test_instances_of_a_run_that_starts_anew(pair: Path) -> None:
+    model = REINFORCE.load(pair / "allocator.zip", env=make_env(), device="cpu")
+    its = ITSCallback("universal", n_epochs=4, strategy="alternate-only")
+    model.learn_instances(16, callback=its)
+    assert trace(its) == "atat" and model.n_instances == 16
+
+
 class Interrupt(BaseCallback):
     """Ends the training at its first step, before any update."""
 
@@ -163,8 +206,8 @@ def test_zips_that_are_no_router(pair: Path) -> None:
         learn(make_allocator(), ITSCallback({"zip": str(pair / "router.zip"), "policy": "MlpPolicy"}, n_epochs=1))
     trained: Any = REINFORCE.load(pair / "allocator.zip", env=make_env())
     trained.its_checkpoint = None
-    with pytest.raises(ValueError, match="or start a new one with its weights"):
-        learn(trained, ITSCallback(str(pair / "router.zip"), n_epochs=1))
+    with pytest.raises(ValueError, match="or router to the zip of a router, to start a new run with both"):
+        learn(trained, make_its())
 
 
 # ------------------------------------------------------------------------------------------------------------ zoo

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -284,6 +285,36 @@ def test_its_goes_on_with_it(room: str, tmp_path: Any, monkeypatch: pytest.Monke
     assert th.equal(parameters(again.router.policy), parameters(expected.router.policy))
     assert not (tmp_path / "second" / CHECKPOINT_FOLDER / WARM_START_FOLDER).exists()
     assert (first / WARM_START_FOLDER).exists()
+
+
+def test_a_resumed_warm_start_is_as_long_as_it_began(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever number of steps the run is resumed with."""
+
+    def epochs(callback: ITSCallback) -> list[tuple[str, int, int, float]]:
+        return [(record.level, record.epoch, record.n_instances, record.objective) for record in callback.records]
+
+    kwargs: dict[str, Any] = dict(n_epochs=4, strategy="its", n_pretraining_epochs=2, n_intensive_epochs=0)
+    unbroken = make_its(**kwargs, save_path=str(tmp_path / "unbroken"))
+    with pytest.warns(UserWarning, match=r"cut to 0\.5 of their length"):
+        make_model().learn(2 * 2 * 8, callback=unbroken)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(imitation, "_varied", interrupt)
+        make_model().learn(2 * 2 * 8, callback=make_its(**kwargs, save_path=str(tmp_path / "broken")))
+    folder = tmp_path / "broken" / CHECKPOINT_FOLDER
+    state = read_state(folder)
+    assert (state["share"], state["warm_started"]) == (0.5, False)
+    model = REINFORCE.load(folder / state["allocator"], env=make_model().env, device="cpu")
+    resumed = make_its(**kwargs, save_path=str(tmp_path / "broken"), resume_from=str(folder))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="This run has")
+        model.learn(3 * 2 * 8, callback=resumed, reset_num_timesteps=False)
+    assert read_state(folder)["share"] == 0.5 and resumed.epoch == 3
+    assert len(epochs(unbroken)) == 1 + 2 * 2 and epochs(resumed)[:5] == epochs(unbroken)
+
+
+def interrupt(*args: Any) -> None:
+    raise KeyboardInterrupt
 
 
 def test_a_warm_start_of_the_users_own() -> None:

@@ -147,6 +147,15 @@ def test_resumed_in_pretraining_equals_an_unbroken_run(tmp_path, monkeypatch):
     assert equal(its.router.policy.state_dict(), resumed_its.router.policy.state_dict())
 
 
+def test_a_complete_run_has_nothing_left_to_learn(tmp_path):
+    learn(make_allocator(), make_its(n_epochs=1, save_path=str(tmp_path)))
+    folder = tmp_path / CHECKPOINT_FOLDER
+    resumed = REINFORCE.load(folder / read_state(folder)["allocator"], env=make_env())
+    with pytest.warns(UserWarning, match=r"its_checkpoint: this run already has 1 of 1 epochs.*Raise n_epochs"):
+        learn(resumed, make_its(n_epochs=1, save_path=str(tmp_path)))
+    assert resumed.n_instances == 8
+
+
 def test_foreign_files_in_the_checkpoint_folder_stay(tmp_path):
     folder = tmp_path / CHECKPOINT_FOLDER
     folder.mkdir()
@@ -190,6 +199,8 @@ RECORD: dict[str, Any] = dict(epoch=1, level="router", phase="alternate", n_inst
         (json.dumps({**INTACT, "router": 5}), "router is 5, not the name of a zip"),
         (json.dumps({**INTACT, "allocator": "../other/model.zip"}), "allocator is '../other/model.zip', not the name"),
         (json.dumps({**INTACT, "warm_started": "yes"}), "warm_started is 'yes'"),
+        (json.dumps({**INTACT, "share": 0}), "share is 0"),
+        (json.dumps({**INTACT, "share": "half"}), "share is 'half'"),
         (json.dumps({**INTACT, "records": {"epoch": 1}}), "records is {'epoch': 1}"),
         (json.dumps({**INTACT, "records": [1]}), "record 0 is 1"),
         (json.dumps({**INTACT, "records": [RECORD, dict(epoch=1)]}), "record 1 is {'epoch': 1}"),

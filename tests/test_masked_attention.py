@@ -122,6 +122,31 @@ def test_a_padding_mask_the_other_way_round_is_an_error():
         make_policy(env).predict(observation)
 
 
+def test_a_scalar_context():
+    """A Box without axes is as good as one of a single entry."""
+
+    class Scalar(gym.ObservationWrapper):
+        shape: tuple[int, ...] = ()
+
+        def __init__(self, env):
+            super().__init__(env)
+            kept: Any = env.observation_space
+            self.observation_space = spaces.Dict({**kept.spaces, "context": spaces.Box(0, 6, self.shape, np.float32)})
+
+        def observation(self, observation):
+            return {**observation, "context": np.full(self.shape, observation["context"], np.float32)}
+
+    class Vector(Scalar):
+        shape = (1,)
+
+    values = []
+    for wrapper in (Scalar, Vector):
+        env = make_vec_env(lambda wrapper=wrapper: wrapper(PickEnv()), 2, seed=0)
+        model = make_model("ppo", env).learn(64)
+        values.append(model.policy.predict_values(tensors(env.reset())))
+    assert values[0].shape == (2, 1) and th.equal(*values)
+
+
 # ------------------------------------------------------------------------------------------------------- invariances
 
 

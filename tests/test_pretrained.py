@@ -12,13 +12,14 @@ import pytest
 from solver_helpers import objectives
 
 from sb3_uav import pretrained
-from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, UniformGenerator
+from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.solvers import make_solver
 from sb3_uav.solvers.dl_drl import load_dl_drl
 from sb3_uav.solvers.network_solver import parameters_hash
+from sb3_uav.solvers.sb3_zip import load_sb3
 from scripts import release
 
 NAMES = pretrained.names()
@@ -69,6 +70,24 @@ def test_names_and_zips() -> None:
         pretrained.pair_files("a.zip")
     with pytest.raises(ValueError, match=r"There is no trained pair 'magic'; choose one of \['universal'\]"):
         pretrained.files("magic")
+
+
+def test_routers_by_name_or_zip(tmp_path: Path) -> None:
+    """The same in every place that takes a router."""
+    shipped = pretrained.files()[1]
+    assert pretrained.router_file("universal") == pretrained.router_file(shipped) == shipped
+    assert pretrained.router_file(str(shipped.with_suffix(""))) == shipped
+    env = TaskAllocationEnv(8, 2)
+    model = pretrained.load("universal", env=env, router="universal", device="cpu")
+    other = pretrained.load("universal", env=env, router=shipped, device="cpu")
+    plans = [found.env.get_attr("problem")[0].router.__self__ for found in (model, other)]
+    assert parameters_hash(plans[0]) == parameters_hash(plans[1]) == parameters_hash(load_policy(shipped, "cpu"))
+    message = r"^router: magic: no such file; give the zip of a router that was trained before, or one of \['universal'\]\.$"
+    with pytest.raises(FileNotFoundError, match=message):
+        pretrained.load("universal", env=env, router="magic")
+    with pytest.raises(FileNotFoundError, match=message):
+        load_sb3(str(pretrained.files()[0]), router="magic")
+    assert load_sb3(str(pretrained.files()[0]), router="universal").files["router"] == shipped
 
 
 def test_release(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from fixed_set_runs import N_UAVS, NETWORK, ROLLOUT, allocation_env, equal, load
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
+from sb3_uav import pretrained
 from sb3_uav.envs import BatchedVecEnv, UniformGenerator, nearest_feasible
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import ITSCallback, PretrainedRouterCallback
@@ -37,6 +38,12 @@ def test_pretrained_router_gives_the_rewards(tmp_path):
     assert np.array_equal(load(run).results[-1], evaluate_fixed_set(model.policy, problem, instances, 0).greedy)
     problem.router = nearest_feasible
     assert not np.array_equal(load(run).results[-1], evaluate_fixed_set(model.policy, problem, instances, 0).greedy)
+
+
+def test_pretrained_router_by_the_name_of_its_pair():
+    assert PretrainedRouterCallback("universal").router == pretrained.files()[1]
+    with pytest.raises(FileNotFoundError, match=r"router: magic: no such file; .* or one of \['universal'\]"):
+        PretrainedRouterCallback("magic")
 
 
 def test_pretrained_router_leaves_random_numbers_alone(tmp_path):

@@ -65,6 +65,31 @@ class NoSize:
         return None
 
 
+class PlainCorner:
+    """A generator without an equality of its own."""
+
+    def __init__(self, n_tasks: int, n_uavs: int, side: float = 1.0) -> None:
+        self.n_tasks, self.n_uavs, self.side = n_tasks, n_uavs, side
+
+    def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
+        return Scaled(self.n_tasks, self.n_uavs, self.side)(batch_size, rng)
+
+
+class PowerOfVisits:
+    """A reward without an equality of its own."""
+
+    def __init__(self, power: float = 0.5) -> None:
+        self.power = power
+
+    def __call__(self, instances: Instances, tours: th.Tensor) -> th.Tensor:
+        return root_of_visits(instances, tours, self.power)
+
+
+class NearestRouter:
+    def __call__(self, instances: Instances) -> th.Tensor:
+        return nearest_feasible(instances)
+
+
 def stripe(n_instances: int, n_tasks: int, rng: np.random.Generator, width: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
     """A distribution: all points in a vertical stripe."""
     points = rng.random((n_instances, n_tasks + 1, 2)) * [width, 1.0]

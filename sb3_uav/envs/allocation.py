@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_uav.envs.customization import make_reward, make_router, make_source, try_reward, try_router
+from sb3_uav.envs.customization import is_drawable, make_reward, make_router, make_source, try_reward, try_router
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
@@ -183,9 +183,10 @@ def _planned_value(instances: Instances, assignment: th.Tensor, router: Router, 
     :param reward: Values the tours; the total value of the tasks on them when None
     :return: ``(batch, n_samples)`` float64
     """
-    instances, assignment = _useful_allocation(instances, assignment)
-    planned = plan_tours(instances, assignment, router)
-    return planned.value if reward is None else score_tours(reward, instances, planned.tours)
+    if reward is not None:
+        # It may depend on which UAV flies a tour, and on how many there are.
+        return score_tours(reward, instances, plan_tours(instances, assignment, router).tours)
+    return plan_tours(*_useful_allocation(instances, assignment), router).value
 
 
 def _alternating(instances: Instances) -> th.Tensor:
@@ -333,9 +334,10 @@ class TaskAllocationEnv(ProblemEnv):
         source = make_source(n_tasks, n_uavs, max_distance, distribution, instances, generator)
         planner = make_router(router)
         problem = AllocationProblem(source, planner, task_order, make_reward(reward))
-        if planner is not None:
+        can_try = is_drawable(generator, source)
+        if planner is not None and can_try:
             try_router(router, planner, _subsets_to_try, source)
-        if problem.reward is not None:
+        if problem.reward is not None and can_try:
             try_reward(reward, lambda drawn: problem.returns(drawn, _alternating(drawn)), source)
         super().__init__(problem, render_mode)
 

@@ -20,8 +20,9 @@ A mapping from the path to further arguments passes those too, as for callbacks 
     env_kwargs:
       generator: {sb3_uav.envs.ClusteredGenerator: {n_clusters: 3}}
 
-Whatever is given is tried out on two instances when the environment is made, without touching any random stream. All four work
-in both drivers. With a reward of the user, episodes have no ``is_success``, which is about the values of tasks.
+Whatever is given is tried out on two instances when the environment is made, without touching any random stream. But nothing
+is drawn from a generator that is given as an object, which may have a state of its own. All four work in both drivers. With a
+reward of the user, episodes have no ``is_success``, which is about the values of tasks.
 """
 
 from __future__ import annotations
@@ -37,11 +38,19 @@ import torch as th
 from sb3_uav.common.imports import import_object, offered
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.envs.distances import distance_limit, euclidean
-from sb3_uav.envs.generators import InstanceGenerator, make_generator
+from sb3_uav.envs.generators import (
+    ClusteredGenerator,
+    FixedGenerator,
+    InstanceGenerator,
+    MixtureGenerator,
+    UniformGenerator,
+    make_generator,
+)
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.rewards import Reward
 
 _N_TRIED = 2
+_STATELESS = (UniformGenerator, ClusteredGenerator, MixtureGenerator, FixedGenerator)
 _PATH_ADVICE = "give the dotted path of one that can be imported from here"
 
 
@@ -59,6 +68,30 @@ class _Call:
 
     def __call__(self, *args: Any) -> Any:
         return self.function(*args, **self.arguments)
+
+
+@dataclass(frozen=True)
+class _Made:
+    """
+    An object of a class without an equality of its own; equal to another that was made in the same way.
+
+    :param factory: What made it
+    :param arguments: Keyword arguments of the factory
+    :param made: The object, whose attributes are found here too
+    """
+
+    factory: Callable[..., Any]
+    arguments: dict[str, Any] = field(hash=False)
+    made: Any = field(compare=False)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.made(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        # Python asks a copy in the making for some of these, which has no object yet.
+        if name.startswith("__") or name == "made":
+            raise AttributeError(name)
+        return getattr(self.made, name)
 
 
 @dataclass(frozen=True)
@@ -133,10 +166,13 @@ def _function(argument: str, given: Any, what: str) -> Callable[..., Any]:
 
 
 def _made(argument: str, given: Any, factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """:return: What the factory makes, equal to whatever it makes with equal arguments"""
     try:
-        return factory(**arguments)
+        made = factory(**arguments)
     except Exception as error:
         raise _refusal(argument, given, f"could not be made with {arguments} ({type(error).__name__}: {error}).") from error
+    equality: Any = type(made).__eq__
+    return _Made(factory, arguments, made) if callable(made) and equality is object.__eq__ else made
 
 
 # ------------------------------------------------------------------------------------------------------------ instances
@@ -149,9 +185,9 @@ def make_source(
     :param n_tasks: Number of tasks, as in :func:`~sb3_uav.envs.generators.make_generator`
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param distribution: Name of a distribution, or one of the user
-    :param instances: Instances or their file; they replace the distribution
-    :param generator: A generator, or what makes it; it replaces all of these
+    :param distribution: Name of a distribution, which an id may have brought along, or one of the user
+    :param instances: Instances or their file; they replace a distribution with a name
+    :param generator: A generator, or what makes it; it replaces a distribution with a name too
     :return: The generator of an environment's instances
     :raises ValueError: If an argument cannot be used, or two contradict each other
     """
@@ -160,7 +196,7 @@ def make_source(
         if not is_named:
             raise ValueError("instances and distribution both say what to draw; give one of them.")
         return make_generator(n_tasks, n_uavs, max_distance, distribution, instances)
-    if generator is not None and (instances is not None or distribution != "uniform"):
+    if generator is not None and (instances is not None or not is_named):
         other = "instances" if instances is not None else "distribution"
         raise ValueError(f"generator and {other} both say what to draw; give one of them.")
     if generator is None:
@@ -185,8 +221,18 @@ def make_source(
         raise _refusal(
             "generator", generator, f"it is of type {type(source).__name__}, which cannot be called with (batch_size, rng)."
         )
-    _try_generator("generator", generator, source, repeatable=is_factory)
+    if is_drawable(generator, source):
+        _try_generator("generator", generator, source, repeatable=is_factory)
     return source
+
+
+def is_drawable(generator: Any, source: InstanceGenerator) -> bool:
+    """
+    :param generator: What an environment was given
+    :param source: The generator that was made of it
+    :return: Whether drawing from it changes nothing. An object of the user may have a state, and other instances the next time
+    """
+    return source is not generator or type(source) in _STATELESS
 
 
 def _parameters(factory: Callable[..., Any]) -> set[str]:
@@ -239,7 +285,7 @@ def make_router(router: Any) -> Callable[[Instances], th.Tensor] | None:
         try:
             found: Callable[[Instances], th.Tensor] = offered("load_router")(router)
         except (ValueError, OSError) as error:
-            raise _refusal("router", router, f"{error}; give a zip, the name of a pair, or a dotted path.") from error
+            raise _refusal("router", router, f"{error} Or give the dotted path of a function.") from error
         return found
     return None if router is None else _function("router", router, "function(instances)")
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_uav.envs.customization import make_reward, make_source, try_reward
+from sb3_uav.envs.customization import is_drawable, make_reward, make_source, try_reward
 from sb3_uav.envs.distances import distance_limit, euclidean
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
@@ -237,6 +237,6 @@ class RoutePlanningEnv(ProblemEnv):
     ) -> None:
         source = make_source(n_tasks, 1, max_distance, distribution, instances, generator)
         problem = RoutingProblem(source, make_reward(reward))
-        if problem.reward is not None:
+        if problem.reward is not None and is_drawable(generator, source):
             try_reward(reward, lambda drawn: problem.returns(drawn, nearest_feasible(drawn)[:, None]), source)
         super().__init__(problem, render_mode)

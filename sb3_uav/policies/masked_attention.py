@@ -161,7 +161,10 @@ class MaskedAttentionExtractor(EncodeOnceExtractor):
 
     def observed_state(self, cache: NodeSetCache, observation: TensorDict) -> NodeSetState:
         mask = observation[self.keys.mask].bool()
-        context = None if self.keys.context is None else observation[self.keys.context].flatten(2)
+        context = None if self.keys.context is None else observation[self.keys.context]
+        if context is not None:
+            # A scalar has no axis to flatten.
+            context = context.reshape(*context.shape[:2], -1)
         real = cache.real[:, None].expand(-1, mask.shape[1], -1)
         if self.n_node_actions == 0:
             return NodeSetState(context, real)

@@ -11,6 +11,7 @@ learning with one of them, on an environment of any size::
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
     from stable_baselines3.common.type_aliases import GymEnv
 
-__all__ = ["files", "load", "names", "pair_files"]
+__all__ = ["files", "load", "names", "pair_files", "router_file"]
 
 DEFAULT_PAIR = "universal"
 ALLOCATOR_FILE, ROUTER_FILE = "allocator.zip", "router.zip"
@@ -62,12 +63,29 @@ def pair_files(allocator: str | None = None, router: str | None = None) -> tuple
     return Path(allocator), Path(router)
 
 
+def router_file(source: str | os.PathLike[str]) -> Path:
+    """
+    :param source: Name of a pair, or the zip of a router; ``.zip`` is appended if there is no such file
+    :return: The router's zip
+    :raises FileNotFoundError: If it is neither
+    """
+    if str(source) in names():
+        return files(str(source))[1]
+    path = Path(source)
+    for found in (path, path.with_name(f"{path.name}.zip")):
+        if found.is_file():
+            return found
+    raise FileNotFoundError(
+        f"router: {path}: no such file; give the zip of a router that was trained before, or one of {names()}."
+    )
+
+
 def load(
     name: str = DEFAULT_PAIR,
     level: str = "allocator",
     env: GymEnv | str | None = None,
     algorithm: str | type[OnPolicyAlgorithm] = "reinforce",
-    router: str | Path | None = None,
+    router: str | os.PathLike[str] | None = None,
     **kwargs: Any,
 ) -> Any:
     """
@@ -84,7 +102,7 @@ def load(
     :param env: The environment (if registered in Gym, can be str)
     :param algorithm: ``"reinforce"``, ``"ppo"``, ``"ppo_mask"``, ``"a2c"``, or the class or dotted path of another on-policy
         algorithm
-    :param router: Zip of another router for the rewards, with ``level="allocator"``
+    :param router: Zip of another router for the rewards, or the name of its pair, with ``level="allocator"``
     :param kwargs: Arguments of the algorithm, and ``policy_kwargs`` that replace those of the zip
     :return: A new model of that algorithm
     :raises FileNotFoundError: If there is no such zip
@@ -100,15 +118,18 @@ def load(
         raise ValueError(f"level is {level!r}; choose 'allocator' or 'router'.")
     if router is not None and level == "router":
         raise ValueError(f"router is {str(router)!r}, but only the rewards of an allocator come from a router; leave it out.")
-    allocator_file, router_file = files(name)
+    allocator_zip, router_zip = files(name)
+    if router is not None:
+        # Before the model is made, as a name may be misspelled.
+        router_zip = router_file(router)
     made: Any = maybe_make_env(env, 0)  # type: ignore[arg-type]
     if made is None:
         raise ValueError("env is missing; give the environment to predict or to learn on, of any size.")
-    path = allocator_file if level == "allocator" else router_file
+    path = allocator_zip if level == "allocator" else router_zip
     # What cannot be learned on is refused before settings are looked up for it.
     transfer.require_fit(path, made)
     model = transfer.load(path, made, algorithm, **{**transfer.fine_tuning_settings(algorithm, made), **kwargs})
     if level == "allocator":
-        planner = load_policy(router or router_file, model.device, RouterPolicy)
+        planner = load_policy(router_zip, model.device, RouterPolicy)
         model.env.env_method("set_router", planner.plan)
     return model

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sb3_uav.pretrained import files, names
+from sb3_uav.pretrained import files, router_file
 
 _ZIP, _PAIR = "zip", "pretrained"
 
@@ -20,7 +20,7 @@ def router_source(router: dict[str, Any] | str | os.PathLike[str]) -> tuple[Path
     :raises ValueError: If it is none of these
     """
     if isinstance(router, str | os.PathLike):
-        return _zip_of(router), {}
+        return router_file(router), {}
     if not isinstance(router, dict) or not router.keys() & {"policy", _ZIP, _PAIR}:
         raise ValueError(
             "router must be the zip of a router, the name of a trained pair, or a mapping with at least one of the keys "
@@ -32,16 +32,4 @@ def router_source(router: dict[str, Any] | str | os.PathLike[str]) -> tuple[Path
         raise ValueError(f"router: '{_ZIP}' is {zip_file!r} and '{_PAIR}' is {pair!r}; give one of them.")
     if pair is not None:
         return files(str(pair))[1], settings
-    return (None if zip_file is None else _existing(Path(zip_file))), settings
-
-
-def _zip_of(source: str | os.PathLike[str]) -> Path:
-    return files(str(source))[1] if str(source) in names() else _existing(Path(source))
-
-
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"router: {path}: no such file; give the zip of a router that was trained before, or one of {names()}."
-        )
-    return path
+    return (None if zip_file is None else router_file(zip_file)), settings

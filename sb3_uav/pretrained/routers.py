@@ -10,7 +10,7 @@ from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.envs.routing import Router
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.pretrained import files, names
+from sb3_uav.pretrained import router_file
 
 
 def load_router(source: str) -> Router:
@@ -20,11 +20,7 @@ def load_router(source: str) -> Router:
     :raises FileNotFoundError: If it is neither
     :raises ValueError: If the zip is damaged or holds another policy
     """
-    if source not in names() and not source.endswith(".zip"):
-        raise FileNotFoundError(f"there is no trained pair of this name; there are {', '.join(names())}")
-    path = files(source)[1] if source in names() else Path(source)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    path = router_file(source)
     return _load(path.resolve(), file_hash(path)).plan
 
 

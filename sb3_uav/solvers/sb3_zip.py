@@ -26,7 +26,7 @@ from sb3_uav.envs.sweep import sweep_order
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import NotOurPolicyError, StoredPolicy, load_policy, read_policy
 from sb3_uav.policies.memory import rows_that_fit
-from sb3_uav.pretrained import files, names
+from sb3_uav.pretrained import router_file
 from sb3_uav.reinforce.algorithms import resolve_algorithm
 from sb3_uav.reinforce.any_size import problem_of_spaces
 from sb3_uav.solvers.kmeans_am import kmeans_assignment
@@ -208,8 +208,8 @@ def load_sb3(
         is not allowed
     """
     path = Path(zip)
-    router_file = None if router is None else files(router)[1] if router in names() else Path(router)
-    planner = None if router_file is None else load_policy(router_file, device, RouterPolicy)
+    router_zip = None if router is None else router_file(router)
+    planner = None if router_zip is None else load_policy(router_zip, device, RouterPolicy)
     policy: BasePolicy
     stored: StoredPolicy | None = None
     try:
@@ -229,7 +229,7 @@ def load_sb3(
             "those of a TaskAllocation or RoutePlanning environment of this package; give a zip that was."
         )
     solver = SB3Solver(policy, problem, planner, task_order, batch_size, identity, stored)
-    solver.files = {"zip": _with_suffix(path)} | ({} if router_file is None else {"router": router_file})
+    solver.files = {"zip": _with_suffix(path)} | ({} if router_zip is None else {"router": router_zip})
     return solver
 
 

@@ -16,8 +16,7 @@ from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, M
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
-from sb3_uav.common.router_progress import router_progress
-from sb3_uav.common.sb3_compat import n_updates, total_timesteps
+from sb3_uav.common.sb3_compat import total_timesteps
 from sb3_uav.common.shared_axis import SharedAxis
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.envs.generators import training_batch
@@ -31,17 +30,20 @@ from sb3_uav.training.best_pair import RouterCallback, take_over
 from sb3_uav.training.its_checkpoint import (
     CHECKPOINT_FOLDER,
     WARM_START_FOLDER,
+    begin_anew,
     check_allocator,
     n_router_epochs,
     noted_checkpoint,
+    origin_of,
     read_state,
     write_checkpoint,
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
 from sb3_uav.training.router_handover import hand_over_router
+from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import find_run_folder
-from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_large_batches
+from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_complete_run, warn_of_large_batches
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
@@ -72,7 +74,8 @@ class ITSCallback(RouterCallback):
         on-policy algorithm), ``n_envs``, and the algorithm's own arguments, among them ``policy``. Or a router that was
         trained before, to go on with: its zip or the name of a pair such as ``"universal"``, with the settings of
         :func:`~sb3_uav.reinforce.transfer.fine_tuning_settings`; or ``{"zip": "router.zip", ...}`` or ``{"pretrained":
-        "universal", ...}`` with other settings of the algorithm. The zip is read without unpickling
+        "universal", ...}`` with other settings of the algorithm. The zip is read without unpickling. An allocator that was
+        trained before then starts a new run at epoch 0, unless it belongs to the checkpoint of a run with this router and size
     :param warm_start: What trains the router before anything else: arguments of
         :func:`~sb3_uav.training.imitation.imitate`, as in ``{"n_updates": 1000}``; or the dotted path of another function and
         its arguments, as in ``{"my_package.start": {"n_steps": 10}}``. It is called with the policies of router and
@@ -141,6 +144,7 @@ class ITSCallback(RouterCallback):
         self._subsets: AllocatedSubsets | None = None
         self._started = False
         self._share = 1.0
+        self._origin: str | None = None
         self._warm_started = warm_start is None
         self._epoch_start = Moment.now()
         self._epoch_first_batch = 0
@@ -175,7 +179,6 @@ class ITSCallback(RouterCallback):
             # Before anything is drawn or saved, so that an unseeded run draws a seed and every zip of it has that seed.
             self._seed()
             warn_of_large_batches(self.model, self.instances_per_epoch, self.problem.generator.n_tasks)
-            self._share = share_of_plan(self.model, self.n_epochs, self.instances_per_epoch, self.problem.generator.n_tasks)
             self._set_up_router()
             self._started = True
         # SB3's algorithms only count steps, which may start again from 0, so instances are counted from here.
@@ -207,16 +210,19 @@ class ITSCallback(RouterCallback):
             self.router_zip,
         )
         self._allocator_freezer = Freezer(self.model.policy)
+        self._origin = origin_of(self.router_zip, self.problem.generator)
         if self.resume_from is None:
-            self.resume_from = noted_checkpoint(self.model)
+            self.resume_from = noted_checkpoint(self.model, self._origin)
+        share: float | None = None
         if self.resume_from is not None:
-            self._resume(self.resume_from)
-        elif n_updates(self.model) > 0:
-            raise ValueError(
-                "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
-                f"{CHECKPOINT_FOLDER} folder of the earlier run, or start a new one with its weights "
-                "(sb3_uav.reinforce.transfer.load) and a router that was trained before."
-            )
+            share = self._resume(self.resume_from)
+        else:
+            begin_anew(self.model, self.router_zip)
+        if share is None:
+            since = self.model.num_timesteps if self.resume_from is None else 0
+            n_tasks = self.problem.generator.n_tasks
+            share = share_of_plan(self.model, self.n_epochs, self.instances_per_epoch, n_tasks, since)
+        self._share = share
         self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
             self._start_router(self.warm_start)
@@ -427,13 +433,17 @@ class ITSCallback(RouterCallback):
         self._save_router()
         if self.save_path is not None:
             folder = self.save_path / CHECKPOINT_FOLDER
-            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, self._warm_started)
+            begun = (self._warm_started, self._share, self._origin)
+            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, *begun)
 
-    def _resume(self, folder: Path) -> None:
+    def _resume(self, folder: Path) -> float | None:
+        """:return: The share of the plan with which the run began, unless an older version wrote the checkpoint"""
         state = read_state(folder)
         check_allocator(folder, state, self.model)
         self.epoch = state["epoch"]
+        warn_of_complete_run(folder, self.epoch, self.n_epochs)
         # Versions that did not write this field saved no checkpoint before the end of the warm start.
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         self._trainer.load(folder / state["router"])
+        return state.get("share")

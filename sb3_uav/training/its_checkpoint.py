@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,8 +13,10 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_uav.common.epoch_log import EpochRecord
-from sb3_uav.common.files import write_atomically
+from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
+from sb3_uav.common.sb3_compat import n_updates
+from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.reinforce import REINFORCE
 
 CHECKPOINT_FOLDER = "its_checkpoint"
@@ -31,6 +34,8 @@ def write_checkpoint(
     epoch: int,
     records: Sequence[EpochRecord],
     warm_started: bool,
+    share: float,
+    origin: str | None,
 ) -> None:
     """
     Write both zips and the state of the strategy.
@@ -43,17 +48,21 @@ def write_checkpoint(
     :param epoch: Finished epochs of the allocator
     :param records: The epochs of both levels so far
     :param warm_started: Whether the router's warm start, if there is one, is over
+    :param share: The part of the planned steps to which warm start and pre-training were cut
+    :param origin: What the run started from, see :func:`origin_of`
     :raises OSError: If a file cannot be written
     """
     # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
     n_instances = getattr(allocator, "n_instances", None)
-    setattr(allocator, CHECKPOINT, {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances})
+    noted = {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances, "origin": origin}
+    setattr(allocator, CHECKPOINT, noted)
     # Another name before the warm start, because a zip that the state file names must not change.
     number = str(n_router_epochs(records)) if warm_started else "start"
     names = {"allocator": f"allocator_{epoch}.zip", "router": f"router_{number}.zip"}
     save_atomically(allocator, folder / names["allocator"])
     save_atomically(router, folder / names["router"])
-    state = {"epoch": epoch, **names, "warm_started": warm_started, "records": [asdict(record) for record in records]}
+    state = {"epoch": epoch, **names, "warm_started": warm_started, "share": share}
+    state["records"] = [asdict(record) for record in records]
     write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
     for old in folder.iterdir():
         if re.fullmatch(r"(allocator|router)_(\d+|start)\.zip", old.name) and old.name not in names.values():
@@ -68,22 +77,62 @@ def n_router_epochs(records: Sequence[EpochRecord]) -> int:
     return sum(record.level == "router" for record in records)
 
 
-def noted_checkpoint(allocator: BaseAlgorithm) -> Path | None:
+def origin_of(router: Path | None, generator: InstanceGenerator) -> str | None:
+    """
+    :param router: Zip of the router that a run is given to start from
+    :param generator: Draws the instances of the fleet
+    :return: What tells the run from one with another router or of another size; None without such a router
+    """
+    return None if router is None else f"{file_hash(router)} {generator.n_uavs} {generator.n_tasks}"
+
+
+def noted_checkpoint(allocator: BaseAlgorithm, origin: str | None) -> Path | None:
     """
     :param allocator: An allocator that was loaded from a zip
-    :return: The checkpoint that it belongs to, if it is still where it was written
+    :param origin: What the run is given to start from; None if it has no router yet
+    :return: The checkpoint that it belongs to, if it is still where it was written, and of a run with the same origin if there
+        is one: with the router of another run, a new one starts
     """
     noted = getattr(allocator, CHECKPOINT, None)
     if not isinstance(noted, dict) or not (Path(str(noted.get("folder"))) / STATE_FILE).is_file():
         return None
+    if origin is not None and noted.get("origin") != origin:
+        return None
     return Path(noted["folder"])
+
+
+def begin_anew(allocator: BaseAlgorithm, router: Path | None) -> None:
+    """
+    Let an allocator forget how far an earlier run has come. Weights, optimizer and random streams go on.
+
+    :param allocator: The allocator's algorithm
+    :param router: Zip of the router that the new run starts from
+    :raises ValueError: If the allocator was trained before, and there is no such router
+    """
+    if n_updates(allocator) > 0:
+        if router is None:
+            raise ValueError(
+                "The allocator has been trained before, but ITSCallback cannot find its router: set resume_from to the "
+                f"{CHECKPOINT_FOLDER} folder of the earlier run, or router to the zip of a router, to start a new run with "
+                "both."
+            )
+        warnings.warn(
+            f"The allocator has been trained before: a new run starts at epoch 0 with it and the router {router}. To go on "
+            f"with an earlier run of ITSCallback, set resume_from to its {CHECKPOINT_FOLDER} folder.",
+            stacklevel=4,
+        )
+    vars(allocator).pop(CHECKPOINT, None)
+    if isinstance(allocator, REINFORCE):
+        if allocator.max_instances is not None:
+            allocator.max_instances -= allocator.n_instances
+        allocator.n_instances = allocator.epoch = 0
 
 
 def read_state(folder: Path) -> dict[str, Any]:
     """
     :param folder: A checkpoint of :class:`~sb3_uav.training.ITSCallback`
     :return: The contents of its state file: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``, and,
-        unless an older version wrote it, ``warm_started``
+        unless an older version wrote it, ``warm_started`` and ``share``
     :raises FileNotFoundError: If there is none
     :raises ValueError: If it is damaged
     """
@@ -106,6 +155,9 @@ def read_state(folder: Path) -> dict[str, Any]:
             raise _damaged(path, f"{level} is {state[level]!r:.40}, not the name of a zip")
     if not isinstance(state.get("warm_started", True), bool):
         raise _damaged(path, f"warm_started is {state['warm_started']!r:.40}")
+    share = state.get("share", 1.0)
+    if not isinstance(share, int | float) or isinstance(share, bool) or not 0 < share <= 1:
+        raise _damaged(path, f"share is {share!r:.40}")
     if not isinstance(state["records"], list):
         raise _damaged(path, f"records is {state['records']!r:.40}")
     for number, record in enumerate(state["records"]):

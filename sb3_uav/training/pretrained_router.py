@@ -13,6 +13,7 @@ from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.envs.allocation import AllocationProblem
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
+from sb3_uav.pretrained import router_file
 from sb3_uav.training.fixed_set_returns import evaluated_problem
 from sb3_uav.training.its import ROUTER_FILE, ITSCallback
 from sb3_uav.training.router_handover import hand_over_router
@@ -30,7 +31,7 @@ class PretrainedRouterCallback(BaseCallback):
         callback:
           - sb3_uav.training.PretrainedRouterCallback: {router: router.zip}
 
-    :param router: Zip of any SB3 algorithm with a ``RouterPolicy``
+    :param router: Zip of any SB3 algorithm with a ``RouterPolicy``, or the name of a pair such as ``"universal"``
     :param save_path: Folder of the copy; the run folder when None
     :param verbose: Verbosity level: 0 for no output
     :raises FileNotFoundError: If there is no such zip
@@ -40,9 +41,7 @@ class PretrainedRouterCallback(BaseCallback):
         self, router: str | os.PathLike[str], save_path: str | os.PathLike[str] | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        self.router = Path(router)
-        if not self.router.is_file():
-            raise FileNotFoundError(f"router: {router}: no such file; give the zip of a router that was trained before.")
+        self.router = router_file(router)
         self.save_path = None if save_path is None else Path(save_path)
 
     def _on_training_start(self) -> None:

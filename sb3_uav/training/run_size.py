@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -48,7 +49,23 @@ def warn_of_large_batches(allocator: BaseAlgorithm, epoch_size: int, n_tasks: in
         )
 
 
-def share_of_plan(allocator: BaseAlgorithm, n_epochs: int, epoch_size: int, n_tasks: int) -> float:
+def warn_of_complete_run(folder: Path, epoch: int, n_epochs: int) -> None:
+    """
+    Warn if a run is resumed that has nothing left to learn.
+
+    :param folder: Its checkpoint
+    :param epoch: Epochs of the allocator that it has
+    :param n_epochs: Planned ones
+    """
+    if epoch >= n_epochs:
+        warnings.warn(
+            f"{folder}: this run already has {epoch} of {n_epochs} epochs, so nothing is left to learn. Raise n_epochs to go "
+            "on with it, or start a new run with its weights (sb3_uav.reinforce.transfer.load).",
+            stacklevel=3,
+        )
+
+
+def share_of_plan(allocator: BaseAlgorithm, n_epochs: int, epoch_size: int, n_tasks: int, since: int = 0) -> float:
     """
     The part of the planned steps that a run takes, with a warning that says what is cut if it is not all of them.
 
@@ -56,11 +73,12 @@ def share_of_plan(allocator: BaseAlgorithm, n_epochs: int, epoch_size: int, n_ta
     :param n_epochs: Planned epochs of the allocator
     :param epoch_size: Instances of an epoch
     :param n_tasks: Tasks of an instance, which are the steps of an episode
+    :param since: Steps before the run
     :return: Above 0, at most 1
     """
     n_samples = allocator.n_samples if isinstance(allocator, REINFORCE) else 1
     planned = n_epochs * epoch_size * n_samples * n_tasks
-    given = total_timesteps(allocator)
+    given = total_timesteps(allocator) - since
     if given >= planned:
         return 1.0
     share = max(given, 1) / planned
