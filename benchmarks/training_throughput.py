@@ -8,7 +8,7 @@ encoding, the others one, so both rates and both ratios are printed.
 ``default``
     The settings of ``TaskAllocation-Universal-v0`` in ``zoo_configs/reinforce.yml``: 8 samples and their mean as the baseline.
 ``paper``
-    The settings of ``paper-U4`` and ``paper-router`` there: width 128, 3 layers, 8 heads, batch normalization, one sample and
+    The settings of ``zoo_configs/paper.yml``: width 128, 3 layers, 8 heads, batch normalization, one sample and
     one greedy rollout of the baseline's policy. As in the paper, the subsets of all UAVs are padded to one size before tours
     are planned. The paper pads them to the number of tasks of the whole instance, N, by repeating tasks: decoding masks the
     repeats, but the encoder sees them, as nodes like any other. Here they are padded to the largest subset of the batch, and
@@ -67,9 +67,9 @@ if TYPE_CHECKING:
     from sb3_uav.policies import RouterPolicy
 
 SERVER = Path(__file__).resolve().with_name("_rl4co_server.py")
-CONFIG = Path(__file__).parents[1] / "zoo_configs" / "reinforce.yml"
-# Entries of the configuration.
-ENTRIES = {"default": "TaskAllocation-Universal-v0", "paper": "paper-U4"}
+CONFIGS = Path(__file__).parents[1] / "zoo_configs"
+# File and entry.
+ENTRIES = {"default": ("reinforce.yml", "TaskAllocation-Universal-v0"), "paper": ("paper.yml", "TaskAllocation-U4-N80-v0")}
 SHAPE = ("embed_dim", "n_layers", "n_heads", "ff_dim", "normalization")
 # Compared competitors, by level.
 PAIRS = {
@@ -110,8 +110,8 @@ def settings_of(name: str) -> dict[str, dict[str, Any]]:
 
     from sb3_uav.reinforce import REINFORCE
 
-    entries = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))
-    allocator = entries[ENTRIES["default" if name == "default" else "paper"]]
+    file, env_id = ENTRIES["default" if name == "default" else "paper"]
+    allocator = yaml.safe_load((CONFIGS / file).read_text(encoding="utf-8"))[env_id]
     its = next(callback for callback in allocator["callback"] if "sb3_uav.training.ITSCallback" in callback)
     router = its["sb3_uav.training.ITSCallback"]["router"]
     known = inspect.signature(REINFORCE).parameters.keys() - {"policy", "env"}

@@ -10,7 +10,9 @@ import pytest
 from doc_blocks import (
     NOT_RUN,
     PAGES,
+    ROOT,
     RULES,
+    TESTED_ELSEWHERE,
     blocks_to_run,
     code_blocks,
     command_lines,
@@ -143,3 +145,9 @@ def test_code_blocks_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
             raise AssertionError(f"{where}\n{error}") from error
     if page in CHECKS:
         CHECKS[page](tmp_path, variables)
+
+
+@pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())
+def test_pages_with_a_test_of_their_own(page: str, test: str) -> None:
+    """The page exists, and that test reads it."""
+    assert (ROOT / page).is_file() and Path(page).name in (Path(__file__).parent / test).read_text(encoding="utf-8")

@@ -103,7 +103,9 @@ def test_the_fused_driver_counts_successes(policy: str, env_class: Any) -> None:
     for distance in (100.0, 1.2):
         env = BatchedVecEnv([lambda distance=distance: env_class(6, max_distance=distance)] * 4)  # type: ignore[misc]
         model = REINFORCE(policy, env, n_samples=2, policy_kwargs=NETWORK, seed=0, device="cpu")
-        evaluation = EvalCallback(env_class(6, max_distance=distance), n_eval_episodes=10, eval_freq=6, verbose=0)
+        evaluation_env = BatchedVecEnv([lambda distance=distance: env_class(6, max_distance=distance)])  # type: ignore[misc]
+        evaluation_env.seed(0)
+        evaluation = EvalCallback(evaluation_env, n_eval_episodes=30, eval_freq=6, verbose=0)
         model.learn(1, callback=evaluation)
         assert model.ep_success_buffer is not None and len(model.ep_success_buffer) == 8
         rates.append((float(np.mean(model.ep_success_buffer)), float(np.mean(evaluation._is_success_buffer))))

@@ -57,11 +57,11 @@ def train_tiny(folder: Path, entries: dict[str, Any], env_id: str, *flags: str, 
 
 
 def test_ids_of_any_size_are_registered_when_they_are_needed() -> None:
-    assert "TaskAllocation-U5-N120-v0" not in gym.registry and "RoutePlanning-N33-v0" not in gym.registry
-    ensure_registered("TaskAllocation-U5-N120-v0")
-    ensure_registered("RoutePlanning-N33-v0")
-    assert problem("TaskAllocation-U5-N120-v0").generator == UniformGenerator(120, 5, 2.0)
-    assert problem("RoutePlanning-N33-v0").generator == UniformGenerator(33, 1, 2.0)
+    assert "TaskAllocation-U7-N123-v0" not in gym.registry and "RoutePlanning-N37-v0" not in gym.registry
+    ensure_registered("TaskAllocation-U7-N123-v0")
+    ensure_registered("RoutePlanning-N37-v0")
+    assert problem("TaskAllocation-U7-N123-v0").generator == UniformGenerator(123, 7, 2.0)
+    assert problem("RoutePlanning-N37-v0").generator == UniformGenerator(37, 1, 2.0)
     ensure_registered("TaskAllocation-U3-N20-v0")
     assert problem("TaskAllocation-U3-N20-v0").generator.max_distance == 1.5
 
