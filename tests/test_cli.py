@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import types
 from typing import Any
@@ -37,7 +38,8 @@ def test_no_command(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize("command", sorted(cli._FORWARDED))
 def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Everything after the command reaches its own parser, options included; its exit code comes back."""
-    module = types.ModuleType(cli._FORWARDED[command][0])
+    name, _, function = cli._FORWARDED[command][0].partition(":")
+    module = types.ModuleType(name)
     received: list[Any] = []
 
     def main(argv: list[str]) -> int | None:
@@ -46,10 +48,18 @@ def test_forwarded_commands(command: str, monkeypatch: pytest.MonkeyPatch, capsy
             raise FileNotFoundError("no\nsuch file")
         return 3 if "three" in argv else None
 
-    module.main = main  # type: ignore[attr-defined]
+    setattr(module, function, main)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     assert cli.main([command, "--help", "-f", "x", "three"]) == 3
     assert cli.main([command]) == 0
     assert received == [["--help", "-f", "x", "three"], []]
     assert cli.main([command, "fail"]) == 2
     assert capsys.readouterr().err == f"sb3-uav {command}: error: no such file\n"
+
+
+@pytest.mark.parametrize("command", cli._FORWARDED)
+def test_commands_exist(command: str) -> None:
+    """What a command names can be called."""
+    pytest.importorskip("rl_zoo3")
+    name, _, function = cli._FORWARDED[command][0].partition(":")
+    assert callable(getattr(importlib.import_module(name), function))

@@ -11,22 +11,22 @@ from importlib import import_module
 import sb3_uav
 from sb3_uav.common.errors import run_command
 
-# Each command has its own parser: its arguments go to the main function of that module.
+# Each command has its own parser: its arguments go to this function, whose result is the exit code; None stands for 0.
 _FORWARDED = {
-    "train": ("sb3_uav.cli.train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
-    "enjoy": ("sb3_uav.cli.enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
-    "record-video": ("sb3_uav.cli.record_video", "record a video of a trained agent (all flags of rl_zoo3's)"),
-    "benchmark": ("sb3_uav.cli.benchmark", "table of all agents of a log folder (all flags of rl_zoo3's benchmark)"),
-    "all-plots": ("sb3_uav.cli.all_plots", "curves and table of evaluations (all flags of rl_zoo3's all_plots)"),
-    "plot-train": ("sb3_uav.cli.plot_train", "curves of training episodes (all flags of rl_zoo3's plot_train)"),
-    "plot-from-file": ("sb3_uav.cli.plot_from_file", "figures from a file of all-plots (all flags of rl_zoo3's)"),
-    "push-to-hub": ("sb3_uav.cli.push_to_hub", "a trained agent and its router to the Hugging Face Hub"),
-    "load-from-hub": ("sb3_uav.cli.load_from_hub", "an agent of the Hugging Face Hub into a log folder"),
-    "evaluate": ("sb3_uav.cli.evaluate", "evaluate zips and solvers on the same instances"),
-    "anytime": ("sb3_uav.cli.anytime", "draw objective against time from an evaluation"),
-    "reproduce": ("sb3_uav.cli.reproduce", "make the tables and figures of the paper"),
-    "compare": ("sb3_uav.cli.compare", "train algorithms at an equal budget and compare them"),
-    "demo": ("sb3_uav.cli.demo", "train and evaluate a small scenario in a few minutes"),
+    "train": ("sb3_uav.zoo.train:train", "train from a zoo YAML (all flags of rl_zoo3's train)"),
+    "enjoy": ("sb3_uav.zoo.enjoy:enjoy", "replay a trained agent (all flags of rl_zoo3's enjoy)"),
+    "record-video": ("sb3_uav.zoo.record_video:record_video", "record a video of a trained agent (all flags of rl_zoo3's)"),
+    "benchmark": ("sb3_uav.zoo.benchmark:benchmark", "table of all agents of a log folder (all flags of rl_zoo3's benchmark)"),
+    "all-plots": ("sb3_uav.zoo.plots:all_plots", "curves and table of evaluations (all flags of rl_zoo3's all_plots)"),
+    "plot-train": ("sb3_uav.zoo.plots:plot_train", "curves of training episodes (all flags of rl_zoo3's plot_train)"),
+    "plot-from-file": ("sb3_uav.zoo.plots:plot_from_file", "figures from a file of all-plots (all flags of rl_zoo3's)"),
+    "push-to-hub": ("sb3_uav.zoo.push_to_hub:push_to_hub", "a trained agent and its router to the Hugging Face Hub"),
+    "load-from-hub": ("sb3_uav.zoo.load_from_hub:load_from_hub", "an agent of the Hugging Face Hub into a log folder"),
+    "evaluate": ("sb3_uav.cli.evaluate:main", "evaluate zips and solvers on the same instances"),
+    "anytime": ("sb3_uav.cli.anytime:main", "draw objective against time from an evaluation"),
+    "reproduce": ("sb3_uav.cli.reproduce:main", "make the tables and figures of the paper"),
+    "compare": ("sb3_uav.cli.compare:main", "train algorithms at an equal budget and compare them"),
+    "demo": ("sb3_uav.cli.demo:main", "train and evaluate a small scenario in a few minutes"),
 }
 
 
@@ -39,16 +39,18 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(argv: Sequence[str]) -> int:
+def _run(argv: Sequence[str]) -> int | None:
     """
     :param argv: Name of a command and its arguments
-    :return: Exit code
+    :return: Exit code; None stands for 0
     """
     if not argv or argv[0] not in _FORWARDED:
         # Prints the help, the version or an error, and exits.
         _make_parser().parse_args(argv[:1])
     # Not by argparse.REMAINDER, which swallows options of this parser that come first.
-    return import_module(_FORWARDED[argv[0]][0]).main(list(argv[1:]))
+    module, _, function = _FORWARDED[argv[0]][0].partition(":")
+    code: int | None = getattr(import_module(module), function)(list(argv[1:]))
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:

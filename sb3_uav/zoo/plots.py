@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from sb3_uav.common.errors import run_command
@@ -68,6 +69,9 @@ def plot(name: str, arguments: Sequence[str]) -> None:
         with temporary_name(path) as temporary:
             figure.savefig(temporary, bbox_inches="tight")
         print(path)
+
+
+all_plots, plot_train, plot_from_file = (partial(plot, name) for name in ("all-plots", "plot-train", "plot-from-file"))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
