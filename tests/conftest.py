@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 # Before anything imports matplotlib: tests never open a window.
 os.environ["MPLBACKEND"] = "Agg"
@@ -126,6 +126,39 @@ def instance_batches(draw: st.DrawFn, max_tasks: int = 8, max_batch: int = 3, un
         max_distance=scale * np.array(reach),
         n_uavs=draw(st.integers(1, 5)),
         task_mask=np.arange(n_tasks) < n_real[:, None],
+    )
+
+
+@st.composite
+def whole_batches(draw: st.DrawFn, max_tasks: int = 8, max_batch: int = 3) -> Instances:
+    """
+    Batches of the whole problem: any of starts, ends, distances of each UAV, service costs and tasks that must be served.
+
+    :param max_tasks: Largest number of tasks
+    :param max_batch: Largest batch
+    """
+    plain = draw(instance_batches(max_tasks, max_batch))
+    batch_size, n_tasks, n_uavs = plain.batch_size, plain.n_tasks, plain.n_uavs
+    rng = np.random.default_rng(draw(seeds))
+    unit = plain.max_distance.numpy()
+
+    def near(share: float) -> np.ndarray:
+        return plain.depot[:, None].numpy() + share * unit[:, None, None] * (rng.random((batch_size, n_uavs, 2)) - 0.5)
+
+    given: dict[str, Any] = {"max_distance": unit}
+    if draw(st.booleans()):
+        given["start"] = near(draw(st.sampled_from([0.0, 0.5, 3.0])))
+    if draw(st.booleans()):
+        given["end"] = near(draw(st.sampled_from([0.0, 0.5, 3.0])))
+    if draw(st.booleans()):
+        given["max_distance"] = unit[:, None] * (rng.random((batch_size, n_uavs)) * (rng.random((batch_size, n_uavs)) < 0.8))
+        given["max_distance"][:, 0] = unit
+    if draw(st.booleans()):
+        given["service"] = draw(st.sampled_from([0.01, 0.2, 2.0])) * unit[:, None] * rng.random((batch_size, n_tasks))
+    if draw(st.booleans()):
+        given["must_serve"] = rng.random((batch_size, n_tasks)) < 0.3
+    return Instances.from_arrays(
+        depot=plain.depot, tasks=plain.tasks, values=plain.values, n_uavs=n_uavs, task_mask=plain.task_mask, **given
     )
 
 

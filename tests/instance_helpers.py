@@ -8,13 +8,13 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs import Instances
-from sb3_uav.envs.instances import _TENSOR_FIELDS
 
 
 def assert_equal(a: Instances, b: Instances) -> None:
     """Bitwise."""
     assert a.n_uavs == b.n_uavs
-    for name in _TENSOR_FIELDS:
+    assert a.present_fields() == b.present_fields()
+    for name in a.present_fields():
         assert getattr(a, name).dtype == getattr(b, name).dtype
         assert th.equal(getattr(a, name), getattr(b, name)), name
 

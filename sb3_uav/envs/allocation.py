@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,6 +95,8 @@ def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     """
     Split instances into one compact single-UAV instance per UAV, keeping the order of the tasks.
 
+    Their values are the :attr:`~sb3_uav.envs.instances.Instances.prizes` of the whole, so that they can be added up.
+
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64; tasks with ``UNASSIGNED`` and padded tasks are left out
     :return: The subsets, ordered by (instance, sample, UAV), padded to the largest
@@ -115,16 +116,21 @@ def split_tasks(instances: Instances, assignment: th.Tensor) -> Subsets:
     task_mask = (slots < counts[..., None]).view(-1, n_slots)
 
     def per_uav(field: th.Tensor) -> th.Tensor:
-        return field.repeat_interleave(n_samples * n_uavs, dim=0)
+        return field[:, None].expand(-1, n_samples, *field.shape[1:]).flatten(0, 2)
 
-    subsets = replace(
-        instances,
-        depot=per_uav(instances.depot),
+    def per_task(field: th.Tensor) -> th.Tensor:
+        return field.gather(1, task_index).view(-1, n_slots)
+
+    subsets = Instances(
+        depot=instances.depot.repeat_interleave(n_samples * n_uavs, dim=0),
         tasks=instances.tasks.gather(1, task_index[..., None].expand(-1, -1, 2)).view(-1, n_slots, 2),
-        values=instances.values.gather(1, task_index).view(-1, n_slots),
-        max_distance=per_uav(instances.max_distance),
+        values=per_task(instances.prizes),
+        max_distance=per_uav(instances.uav_distance),
         n_uavs=1,
         task_mask=task_mask,
+        start=None if instances.start is None else per_uav(instances.start)[:, None],
+        end=None if instances.end is None else per_uav(instances.end)[:, None],
+        service=None if instances.service is None else per_task(instances.service),
     )
     return Subsets(subsets, task_index.view(-1, n_slots))
 
@@ -165,14 +171,14 @@ def _useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Ins
     :return: Both unchanged if there are at most as many UAVs as tasks. Otherwise the instances with one UAV per task, and the
         assignment with the UAVs that have tasks renumbered from 0 in the same order
     """
-    if instances.n_uavs <= instances.n_tasks:
+    if instances.n_uavs == instances.useful_fleet:
         return instances, assignment
     left_out = (assignment == UNASSIGNED) | ~instances.task_mask[:, None]
     sorted_uavs, order = assignment.masked_fill(left_out, instances.n_uavs).sort(dim=-1)
     number = th.zeros_like(assignment)
     number[..., 1:] = (sorted_uavs[..., 1:] != sorted_uavs[..., :-1]).cumsum(-1)
     numbered = number.scatter(-1, order, number).masked_fill(left_out, UNASSIGNED)
-    return replace(instances, n_uavs=instances.useful_fleet), numbered
+    return instances.with_fleet(instances.useful_fleet), numbered
 
 
 def _planned_value(instances: Instances, assignment: th.Tensor, router: Router, reward: Reward | None = None) -> th.Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +89,7 @@ class Episodes:
                 f"The instance has {instances.n_tasks} tasks, but the observation space holds {n_tasks}; "
                 "make the environment with a larger n_tasks."
             )
-        return replace(self.problem.arrange(instances).pad(n_tasks), n_uavs=n_uavs)
+        return self.problem.arrange(instances).pad(n_tasks).with_fleet(n_uavs)
 
     def step(self, actions: np.ndarray) -> StepResult:
         """

@@ -201,7 +201,7 @@ class Problem(ABC):
         """
         if self.reward is not None:
             return None
-        possible = (instances.values * instances.reachable()).sum(1)
+        possible = (instances.prizes * instances.reachable()).sum(1)
         # Returns may have been added up in another order.
         return returns >= (1 - _ROUNDING) * possible[:, None]
 
@@ -224,7 +224,7 @@ class Problem(ABC):
         return {
             "depot": instances.depot.float(),
             "tasks": instances.tasks.float().flatten(1),
-            "task_values": instances.values.float(),
+            "task_values": instances.prizes.float(),
             "task_mask": instances.task_mask.to(th.int8),
             "max_distance": instances.max_distance.float()[:, None],
         }

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from torch.nn import functional
 
 from sb3_uav.envs.customization import is_drawable, make_reward, make_source, try_reward
 from sb3_uav.envs.distances import distance_limit, euclidean
@@ -43,18 +44,23 @@ class RoutingDynamics(Dynamics):
     """
     Transitions of route planning (paper, section IV-B).
 
-    A task is legal if it is unvisited and the UAV can fly to it and back to the depot: traveled + d(here, task) +
-    d(task, depot) <= D. The depot is legal only when no task is, because an early return never helps. An illegal action
-    sends the UAV to the depot and ends the episode.
+    A task is legal if it is unvisited and the UAV can fly to it, serve it and fly on to its end: traveled + d(here, task) +
+    service + d(task, end) <= D. The depot (node 0: the start, and as an action the flight to the end) is legal only when no
+    task is, because an early return never helps. An illegal action sends the UAV to its end and ends the episode.
 
-    :param instances: The instances; each row is one UAV's tasks, ``n_uavs`` is not used
+    :param instances: The instances; each row is the tasks of one UAV, the first of its fleet
     """
 
     def __init__(self, instances: Instances) -> None:
         super().__init__(instances)
-        self.nodes = th.cat([instances.depot[:, None], instances.tasks], dim=1)
-        self.home = euclidean(self.nodes, instances.depot[:, None])
-        self.limit = distance_limit(instances.max_distance)
+        start, end = instances.uav_start[:, :1], instances.uav_end[:, :1]
+        self.nodes = th.cat([start, instances.tasks], dim=1)
+        self.home = euclidean(self.nodes, end)
+        self.max_distance = instances.uav_distance[:, 0]
+        self.limit = distance_limit(self.max_distance)
+        self.service = None if instances.service is None else functional.pad(instances.service, (1, 0))
+        # From each node: what is left to do once the UAV is there.
+        self.homeward = self.home if self.service is None else self.home + self.service
         self._rows = th.arange(len(instances), device=instances.device)[:, None]
 
     def points(self, nodes: th.Tensor) -> th.Tensor:
@@ -75,7 +81,7 @@ class RoutingDynamics(Dynamics):
 
     def _action_mask(self, position: th.Tensor, visited: th.Tensor, traveled: th.Tensor, done: th.Tensor) -> th.Tensor:
         here = self.points(position)
-        detour = euclidean(self.nodes[:, None, 1:], here[:, :, None]) + self.home[:, None, 1:]
+        detour = euclidean(self.nodes[:, None, 1:], here[:, :, None]) + self.homeward[:, None, 1:]
         feasible = ~visited & (traveled[..., None] + detour <= self.limit[:, None, None]) & ~done[..., None]
         return th.cat([~feasible.any(-1, keepdim=True), feasible], dim=-1)
 
@@ -83,15 +89,17 @@ class RoutingDynamics(Dynamics):
         legal = state.action_mask.gather(-1, actions[..., None]).squeeze(-1)
         node = th.where(legal, actions, DEPOT)
         goes_home = (node == DEPOT) & ~state.done
-        here, there = self.points(state.position), self.points(node)
-        # A finished UAV stays at the depot: its leg has length 0.
-        traveled = state.traveled + euclidean(there, here)
+        leg = euclidean(self.points(node), self.points(state.position))
+        leg = th.where(node == DEPOT, self.home.gather(1, state.position), leg)
+        if self.service is not None:
+            leg = leg + self.service.gather(1, node)
+        # A finished UAV stays where it is.
+        traveled = state.traveled + leg.masked_fill(state.done, 0.0)
         # The extra first column absorbs visits to the depot.
         visited = th.cat([th.zeros_like(state.visited[..., :1]), state.visited], dim=-1)
         visited = visited.scatter(-1, node[..., None], True)[..., 1:]
         done = state.done | goes_home
-        prizes = th.cat([th.zeros_like(self.instances.values[:, :1]), self.instances.values], dim=1)
-        rewards = prizes.gather(1, node)
+        rewards = functional.pad(self.instances.prizes, (1, 0)).gather(1, node)
         return RoutingState(node, visited, traveled, done, self._action_mask(node, visited, traveled, done)), rewards
 
 
@@ -147,13 +155,13 @@ def nearest_feasible(instances: Instances) -> th.Tensor:
 
 def collected_value(instances: Instances, tours: th.Tensor) -> th.Tensor:
     """
-    Total value of the tasks of each tour.
+    Total value of the tasks of each tour, see :attr:`~sb3_uav.envs.instances.Instances.prizes`.
 
     :param instances: ``batch`` instances
     :param tours: ``(batch, ..., n_steps)`` int64 node indices without repeated tasks, padded with the depot
     :return: ``(batch, ...)`` float64
     """
-    prizes = th.cat([th.zeros_like(instances.values[:, :1]), instances.values], dim=1)
+    prizes = functional.pad(instances.prizes, (1, 0))
     return prizes.gather(1, tours.flatten(1)).view(tours.shape).sum(-1)
 
 
@@ -184,7 +192,7 @@ class RoutingProblem(Problem):
         return RoutingDynamics(instances) if self.reward is None else _ScoredDynamics(instances, self.reward)
 
     def observe(self, dynamics: RoutingDynamics, state: RoutingState) -> dict[str, th.Tensor]:
-        remaining = dynamics.instances.max_distance[:, None] - state.traveled
+        remaining = dynamics.max_distance[:, None] - state.traveled
         return {
             "position": state.position,
             "remaining_distance": remaining,

@@ -19,7 +19,7 @@ class InfeasibleScheduleError(ValueError):
 @dataclass(frozen=True, init=False)
 class Schedule:
     """
-    One route per UAV. Every route starts and ends at the depot, which is not listed.
+    One route per UAV. Start and end of the UAV, usually the depot, are not listed.
 
     :param routes: Task indices from 0, in flying order
     """
@@ -40,11 +40,15 @@ class ScheduleReport:
     Result of checking a feasible schedule.
 
     :param objective: Total value of the visited tasks
-    :param lengths: Length of every UAV's closed tour, in the unit of the coordinates
+    :param lengths: Length of every given route with its service costs, in the unit of the coordinates. A UAV without tasks
+        flies straight from its start to its end, or stays where it is if it cannot
+    :param unserved: Tasks that must be served and are not. Of two schedules the one with fewer of them is better, whatever
+        their objectives
     """
 
     objective: float
     lengths: tuple[float, ...]
+    unserved: tuple[int, ...] = ()
 
     @property
     def length(self) -> float:
@@ -70,7 +74,8 @@ def check_schedule(instances: Instances, row: int, schedule: Schedule) -> Schedu
     tasks = instances.tasks[row].tolist()
     values = instances.values[row].tolist()
     n_tasks = sum(instances.task_mask[row].tolist())
-    max_distance = float(instances.max_distance[row])
+    given_service = None if instances.service is None else instances.service[row].tolist()
+    must_serve = [] if instances.must_serve is None else instances.must_serve[row].tolist()
     if len(schedule.routes) > instances.n_uavs:
         raise InfeasibleScheduleError(f"{len(schedule.routes)} routes for a fleet of {instances.n_uavs} UAVs.")
     seen: dict[int, int] = {}
@@ -82,16 +87,25 @@ def check_schedule(instances: Instances, row: int, schedule: Schedule) -> Schedu
             if task in seen:
                 raise InfeasibleScheduleError(f"Task {task} is visited twice, by UAV {seen[task]} and UAV {uav}.")
             seen[task] = uav
-        stops = [depot, *(tasks[task] for task in route), depot]
+        start = depot if instances.start is None else instances.start[row, uav].tolist()
+        end = depot if instances.end is None else instances.end[row, uav].tolist()
+        own = instances.max_distance[row] if instances.max_distance.dim() == 1 else instances.max_distance[row, uav]
+        max_distance = float(own)
+        stops = [start, *(tasks[task] for task in route), end]
         length = 0.0
         for a, b in itertools.pairwise(stops):
             length += math.hypot(a[0] - b[0], a[1] - b[1])
+        if given_service is not None:
+            length += math.fsum(given_service[task] for task in route)
+        if not route and length > max_distance:
+            length = 0.0
         if not length <= max_distance + DISTANCE_TOLERANCE * max_distance:
             raise InfeasibleScheduleError(
                 f"UAV {uav} flies {length:.9f}, which is {length - max_distance:.3g} over its maximum of {max_distance:.9f}."
             )
         lengths.append(length)
-    return ScheduleReport(math.fsum(values[task] for task in seen), tuple(lengths))
+    unserved = tuple(task for task in range(n_tasks) if must_serve and must_serve[task] and task not in seen)
+    return ScheduleReport(math.fsum(values[task] for task in seen), tuple(lengths), unserved)
 
 
 def schedule_to_json(solver: str, row: int, schedule: Schedule, report: ScheduleReport) -> dict[str, Any]:

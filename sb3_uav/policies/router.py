@@ -196,7 +196,7 @@ class RouterPolicy(EpisodicPolicy):
 
     @staticmethod
     def _decoder_state(dynamics: RoutingDynamics, state: RoutingState) -> RouterState:
-        remaining = dynamics.instances.max_distance[:, None] - state.traveled
+        remaining = dynamics.max_distance[:, None] - state.traveled
         return RouterState(state.position, remaining.float(), state.action_mask)
 
     def _decode_episodes(

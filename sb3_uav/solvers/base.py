@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,12 +57,14 @@ class Solver(ABC):
 
     :ivar uses_time_limit: Whether the schedules may depend on the time limit; if not, evaluations at several time limits run
         the solver once
+    :ivar solves_whole_problem: Whether UAVs may have their own starts, ends and distances, and tasks service costs
     :ivar name: Label in tables and files
     :ivar spec: The text that :func:`~sb3_uav.solvers.registry.make_solver` made it from
     :ivar files: Files that it was loaded from, by their purpose; evaluations record their hashes
     """
 
     uses_time_limit: bool = True
+    solves_whole_problem: bool = False
     name: str
     spec: str | None = None
     files: Mapping[str, Path] = {}
@@ -74,13 +76,20 @@ class Solver(ABC):
         """
         return {} if self.spec is None else {"spec": self.spec}
 
-    def check(self, instances: Instances) -> None:  # noqa: B027 (most solvers take any instances)
+    def check(self, instances: Instances) -> None:
         """
         Called for all instances before any solver runs, so that a long evaluation does not fail halfway.
 
         :param instances: The instances to solve
         :raises ValueError: If the solver cannot solve them; the message says why
         """
+        # What must be served is a matter of value for every solver, see CountingTasks.
+        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        if beyond and not self.solves_whole_problem:
+            raise ValueError(
+                f"{self.name} solves only instances whose UAVs all fly equally far, from the depot to the depot, without "
+                f"service costs; these have {', '.join(beyond)}; choose another solver."
+            )
 
     def prepare(self) -> None:  # noqa: B027 (most solvers have nothing to prepare)
         """
@@ -150,15 +159,18 @@ class OneByOneSolver(Solver):
         :param seed: As for :meth:`solve`
         :return: The result that :meth:`solve` has for that row
         """
+        self.check(instance)
         self.prepare()
         start = time.perf_counter()
         counting = CountingTasks.of(instance)
         # A row that is all padding keeps one slot, because every instance has one.
         n_tasks = max(int(counting.instances.task_mask.sum()), 1)
-        reduced = replace(counting.instances.trim(n_tasks), n_uavs=counting.n_useful_uavs()[0])
+        reduced = counting.instances.trim(n_tasks).with_fleet(counting.n_useful_uavs()[0])
         solution = self.solve_one(reduced, time_limit, keyed_generator(seed, row))
         schedule = counting.schedule(0, solution.schedule)
-        return SolverResult(schedule, time.perf_counter() - start, bound=solution.bound)
+        # With tasks that must be served, it bounds prizes, not values.
+        bound = solution.bound if instance.must_serve is None else None
+        return SolverResult(schedule, time.perf_counter() - start, bound=bound)
 
     def solve_rows(
         self, instances: Instances, rows: Sequence[int], time_limit: float | None = None, seed: int = 0

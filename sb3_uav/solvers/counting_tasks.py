@@ -19,8 +19,11 @@ class CountingTasks:
     """
     Instances without the tasks that no UAV can reach or that are worth nothing.
 
+    What must be served has become a matter of value, see :attr:`~sb3_uav.envs.instances.Instances.prizes`.
+
     :param original: ``batch`` instances
     :param instances: The same with the remaining tasks at the beginning of each row; the original itself if all tasks count
+        and none must be served
     :param index: ``(batch, n_slots)`` int64, the original task in each slot
     """
 
@@ -34,10 +37,13 @@ class CountingTasks:
         :param instances: ``batch`` instances, possibly padded
         :return: What counts of them
         """
+        original = instances
+        if instances.must_serve is not None:
+            instances = replace(instances, values=instances.prizes, must_serve=None)
         counts = instances.reachable() & (instances.values > 0)
         if th.equal(counts, instances.task_mask):
             index = th.arange(instances.n_tasks, device=instances.device).expand(len(instances), -1)
-            return cls(instances, instances, index)
+            return cls(original, instances, index)
         index = (~counts).long().argsort(dim=1, stable=True)
         task_mask = counts.gather(1, index)
         # A row in which no task counts keeps one padded slot.
@@ -49,10 +55,12 @@ class CountingTasks:
             tasks=th.where(padded[..., None], arranged.depot[:, None], arranged.tasks),
             values=arranged.values.masked_fill(padded, 0.0),
         )
-        return cls(instances, compact, index[:, :n_slots])
+        return cls(original, compact, index[:, :n_slots])
 
     def n_useful_uavs(self) -> list[int]:
-        """:return: How many UAVs of each instance can be of use: at most one per task, and at least one"""
+        """:return: How many UAVs of each instance can be of use: of equal ones at most one per task, and at least one"""
+        if not self.instances.has_equal_uavs:
+            return [self.instances.n_uavs] * len(self.instances)
         return [min(self.instances.n_uavs, max(n_tasks, 1)) for n_tasks in self.instances.task_mask.sum(1).tolist()]
 
     def schedule(self, row: int, found: Schedule) -> Schedule:
@@ -63,7 +71,9 @@ class CountingTasks:
             :data:`LARGEST_LISTED_FLEET` or than there are tasks. It is at least as good as visiting the most valuable tasks
             one by one: where the solver found less, it is just that
         """
-        n_useful = min(self.original.n_uavs, int(self.original.task_mask[row].sum()))
+        n_useful = self.original.n_uavs
+        if self.original.has_equal_uavs:
+            n_useful = min(n_useful, int(self.original.task_mask[row].sum()))
         n_routes = min(self.original.n_uavs, max(n_useful, LARGEST_LISTED_FLEET))
         tasks = self.index[row].tolist()
         n_tasks = int(self.instances.task_mask[row].sum())
@@ -71,8 +81,27 @@ class CountingTasks:
             # A faulty schedule stays what it is, for the checker to refuse.
             return found
         values = self.instances.values[row].tolist()
-        single = sorted(range(n_tasks), key=lambda task: -values[task])[:n_useful]
-        if math.fsum(values[task] for route in found.routes for task in route) < math.fsum(values[task] for task in single):
-            found = Schedule([[task] for task in single])
+        single = self._one_each(row, n_useful)
+        visited = (task for route in found.routes for task in route)
+        if math.fsum(values[task] for task in visited) < math.fsum(values[task] for route in single for task in route):
+            found = Schedule(single)
         routes = [[tasks[task] for task in route] for route in found.routes]
         return Schedule(routes + [[]] * (n_routes - len(routes)))
+
+    def _one_each(self, row: int, n_useful: int) -> list[list[int]]:
+        """
+        :param row: Row of an instance
+        :param n_useful: Number of UAVs
+        :return: Routes of one task each, the most valuable ones; a UAV of an unequal fleet gets the most valuable that it can
+            reach and that the UAVs before it have left
+        """
+        values = self.instances.values[row].tolist()
+        ranked = sorted(range(int(self.instances.task_mask[row].sum())), key=lambda task: -values[task])
+        if self.instances.has_equal_uavs:
+            return [[task] for task in ranked[:n_useful]]
+        routes: list[list[int]] = []
+        for reach in self.instances[row].reachable_by_uav()[0].tolist():
+            route = [task for task in ranked if reach[task]][:1]
+            ranked = [task for task in ranked if task not in route]
+            routes.append(route)
+        return routes

@@ -88,6 +88,7 @@ class DLDRL(BatchedSolver):
         return DLDRL(allocator, router, self.decode, self.samples, self.batch_size, name, *refinement)
 
     def check(self, instances: Instances) -> None:
+        super().check(instances)
         self.allocator.check_fleet(instances)
 
     def settings(self) -> dict[str, Any]:

@@ -94,6 +94,7 @@ class MILP(TimeLimitedSolver):
         self.backend = BACKENDS[backend]()
 
     def check(self, instances: Instances) -> None:
+        super().check(instances)
         """
         :param instances: The instances to solve
         :raises ValueError: If the model of one of them is too large for the backend

@@ -27,6 +27,7 @@ class RandomNearest(OneByOneSolver):
     """Every task goes to a random UAV, every UAV to its nearest feasible task."""
 
     name = "random-nearest"
+    solves_whole_problem = True
     uses_time_limit = False
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
@@ -42,6 +43,7 @@ class KMeansNearest(OneByOneSolver):
     """
 
     name = "kmeans-nearest"
+    solves_whole_problem = True
     uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:

@@ -6,7 +6,6 @@ import hashlib
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import torch as th
 
@@ -63,7 +62,7 @@ class BatchedSolver(Solver):
         fleets = counting.n_useful_uavs() if self.serves_any_fleet else [instances.n_uavs] * len(rows)
         # A batch holds fleets of one size, so that the schedule of an instance does not depend on the others in its batch.
         for n_uavs in dict.fromkeys(fleets):
-            group = replace(counting.instances, n_uavs=n_uavs)
+            group = counting.instances.with_fleet(n_uavs)
             places = [place for place, fleet in enumerate(fleets) if fleet == n_uavs]
             fitting = self.rows_that_fit(group)
             batch_size = min(self.batch_size or fitting, fitting)

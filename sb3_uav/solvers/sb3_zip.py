@@ -100,6 +100,7 @@ class SB3Solver(BatchedSolver):
         return {"policy": self.identity, "router": router, "task_order": self.task_order}
 
     def check(self, instances: Instances) -> None:
+        super().check(instances)
         if self.stored is not None:
             if isinstance(self.policy, AllocatorPolicy):
                 self.policy.check_fleet(instances)

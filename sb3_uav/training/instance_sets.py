@@ -7,7 +7,6 @@ import hashlib
 import io
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +86,7 @@ class InstanceSets:
 
     def for_one_uav(self) -> InstanceSets:
         """The same instances for a single UAV each."""
-        return InstanceSets({name: replace(instances, n_uavs=1) for name, instances in self.sets.items()}, self.is_grid)
+        return InstanceSets({name: instances.with_fleet(1) for name, instances in self.sets.items()}, self.is_grid)
 
     def means(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch as th
@@ -41,11 +40,11 @@ class WholeInstances(SingleUavGenerator):
     """
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
-        return replace(self.generator(batch_size, rng), n_uavs=1)
+        return self.generator(batch_size, rng).with_fleet(1)
 
     def training_batch(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """The same for the generator's training batches."""
-        return replace(training_batch(self.generator, batch_size, rng), n_uavs=1)
+        return training_batch(self.generator, batch_size, rng).with_fleet(1)
 
 
 class AllocatedSubsets(SingleUavGenerator):
