@@ -27,13 +27,25 @@ class AllocationState(NamedTuple):
     :param assignment: ``(batch, n_samples, n_tasks)`` int64, the UAV of each task; ``UNASSIGNED`` if it has none yet
     :param task: ``(batch, n_samples)`` int64, index of the task to allocate next
     :param done: ``(batch, n_samples)`` bool, True when every real task has a UAV
-    :param action_mask: ``(batch, n_samples, n_uavs)`` bool; any UAV may take any task
+    :param action_mask: ``(batch, n_samples, n_uavs)`` bool, see :func:`allowed_uavs`
     """
 
     assignment: th.Tensor
     task: th.Tensor
     done: th.Tensor
     action_mask: th.Tensor
+
+
+def allowed_uavs(instances: Instances) -> th.Tensor | None:
+    """
+    :param instances: ``batch`` instances
+    :return: Which UAVs may take each task: where UAVs differ, those that could serve it alone, or all if none could;
+        ``(batch, n_tasks, n_uavs)`` bool. None where any UAV may take any task
+    """
+    if instances.has_equal_uavs:
+        return None
+    reach = instances.reachable_by_uav().transpose(1, 2)
+    return reach | ~reach.any(-1, keepdim=True)
 
 
 class AllocationDynamics(Dynamics):
@@ -52,6 +64,7 @@ class AllocationDynamics(Dynamics):
         self.router = router
         self.reward = reward
         self._n_real = instances.task_mask.sum(1)[:, None]
+        self._allowed = allowed_uavs(instances)
 
     def reset(self, n_samples: int = 1) -> AllocationState:
         batch_size, n_tasks = self.instances.task_mask.shape
@@ -61,9 +74,20 @@ class AllocationDynamics(Dynamics):
             assignment=th.full((batch_size, n_samples, n_tasks), UNASSIGNED, dtype=th.int64, device=device),
             task=task,
             done=task >= self._n_real,
-            # Expanded, as the fleet may be absurdly large.
-            action_mask=th.ones(1, dtype=th.bool, device=device).expand(batch_size, n_samples, self.instances.n_uavs),
+            action_mask=self._action_mask(task),
         )
+
+    def _action_mask(self, task: th.Tensor) -> th.Tensor:
+        """
+        :param task: ``(batch, n_samples)`` int64, the task to allocate
+        :return: ``(batch, n_samples, n_uavs)`` bool
+        """
+        shape = (*task.shape, self.instances.n_uavs)
+        if self._allowed is None:
+            # Expanded, as the fleet may be absurdly large.
+            return th.ones(1, dtype=th.bool, device=task.device).expand(shape)
+        slot = task.clamp(max=self.instances.n_tasks - 1)[..., None]
+        return self._allowed.gather(1, slot.expand(shape))
 
     def step(self, state: AllocationState, actions: th.Tensor) -> tuple[AllocationState, th.Tensor]:
         active = ~state.done
@@ -78,7 +102,8 @@ class AllocationDynamics(Dynamics):
         if rows.any():
             value = _planned_value(self.instances[rows], assignment[rows], self.router, self.reward)
             rewards[rows] = value.where(finished[rows], 0.0)
-        return AllocationState(assignment, task, done, state.action_mask), rewards
+        action_mask = state.action_mask if self._allowed is None else self._action_mask(task)
+        return AllocationState(assignment, task, done, action_mask), rewards
 
 
 class Subsets(NamedTuple):

@@ -84,11 +84,19 @@ class Episodes:
                 f"The instance has {instances.n_uavs} UAVs, but the environment was made for {n_uavs}; "
                 f"make the environment with n_uavs={instances.n_uavs}."
             )
+        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        if beyond and not self.problem.is_whole:
+            raise ValueError(
+                f"The instance has {', '.join(beyond)}, which the observations of this environment do not show; make it with "
+                "a generator of such instances."
+            )
         if instances.n_tasks > n_tasks:
             raise ValueError(
                 f"The instance has {instances.n_tasks} tasks, but the observation space holds {n_tasks}; "
                 "make the environment with a larger n_tasks."
             )
+        if self.problem.is_whole and not self.problem.uses_fleet:
+            n_uavs = 1
         return self.problem.arrange(instances).pad(n_tasks).with_fleet(n_uavs)
 
     def step(self, actions: np.ndarray) -> StepResult:

@@ -31,6 +31,14 @@ class InstanceGenerator(Protocol):
         ...
 
 
+def goes_beyond_the_paper(generator: InstanceGenerator) -> bool:
+    """
+    :param generator: Any generator; one of more than the paper's problem has an attribute ``beyond_the_paper`` that is true
+    :return: Whether its instances may have starts, ends and distances of each UAV, or service costs
+    """
+    return bool(getattr(generator, "beyond_the_paper", False))
+
+
 def _check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
     """
     :param n_tasks: Number of tasks
@@ -216,6 +224,11 @@ class FixedGenerator:
     @property
     def n_uavs(self) -> int:
         return self.instances.n_uavs
+
+    @property
+    def beyond_the_paper(self) -> bool:
+        """Whether the instances have more than tasks that must be served."""
+        return any(name != "must_serve" for name in self.instances.beyond_the_paper)
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         return self.instances[rng.integers(len(self.instances), size=batch_size)]

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_uav.envs.generators import InstanceGenerator
+from sb3_uav.envs.generators import InstanceGenerator, goes_beyond_the_paper
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.rewards import Reward
 
@@ -21,6 +21,8 @@ StateT = TypeVar("StateT", bound="_State")
 
 # The keys of an observation that do not change during an episode.
 STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
+# Those that come with them where instances go beyond the paper's problem.
+WHOLE_KEYS = ("uav_start", "uav_end", "uav_distance", "service")
 
 
 class Stage(Enum):
@@ -104,6 +106,11 @@ class Problem(ABC):
         :raises ValueError: If its instances do not fit the observation space
         """
         old, new = self.generator, generator
+        if goes_beyond_the_paper(new) and not goes_beyond_the_paper(old):
+            raise ValueError(
+                "The new generator goes beyond the paper's problem (starts, ends, distances or service costs), which the "
+                "observations of this environment do not show; make a new environment."
+            )
         if (new.n_tasks, new.n_uavs) != (old.n_tasks, old.n_uavs):
             raise ValueError(
                 f"The new generator draws {new.n_tasks} tasks and {new.n_uavs} UAVs, the environment was made for "
@@ -119,7 +126,7 @@ class Problem(ABC):
 
     def _static_spaces(self) -> dict[str, spaces.Space]:
         n_tasks = self.generator.n_tasks
-        return {
+        plain: dict[str, spaces.Space] = {
             "depot": spaces.Box(-np.inf, np.inf, (2,), np.float32),
             # Flat, x and y in turn, because SB3's env checker advises against 2D observations.
             "tasks": spaces.Box(-np.inf, np.inf, (2 * n_tasks,), np.float32),
@@ -128,6 +135,26 @@ class Problem(ABC):
             "task_mask": spaces.MultiBinary(n_tasks),
             "max_distance": spaces.Box(0.0, np.inf, (1,), np.float32),
         }
+        if not self.is_whole:
+            return plain
+        n_uavs = self.generator.n_uavs if self.uses_fleet else 1
+        return {
+            **plain,
+            "uav_start": spaces.Box(-np.inf, np.inf, (2 * n_uavs,), np.float32),
+            "uav_end": spaces.Box(-np.inf, np.inf, (2 * n_uavs,), np.float32),
+            "uav_distance": spaces.Box(0.0, np.inf, (n_uavs,), np.float32),
+            "service": spaces.Box(0.0, np.inf, (n_tasks,), np.float32),
+        }
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether observations show what goes beyond the paper's problem: starts, ends, distances and service costs."""
+        return goes_beyond_the_paper(self.generator)
+
+    @property
+    def static_keys(self) -> tuple[str, ...]:
+        """Keys of the observation that do not change during an episode."""
+        return STATIC_KEYS + WHOLE_KEYS if self.is_whole else STATIC_KEYS
 
     @abstractmethod
     def dynamics(self, instances: Instances) -> Dynamics:
@@ -212,8 +239,7 @@ class Problem(ABC):
         """
         return instances
 
-    @staticmethod
-    def observe_static(instances: Instances) -> dict[str, th.Tensor]:
+    def observe_static(self, instances: Instances) -> dict[str, th.Tensor]:
         """
         The part of the observation that does not change during an episode.
 
@@ -221,10 +247,19 @@ class Problem(ABC):
         :return: Tensors with leading dimension ``batch``, float32; coordinates are those of :meth:`Instances.near_origin`
         """
         instances = instances.near_origin()
-        return {
+        plain = {
             "depot": instances.depot.float(),
             "tasks": instances.tasks.float().flatten(1),
             "task_values": instances.prizes.float(),
             "task_mask": instances.task_mask.to(th.int8),
-            "max_distance": instances.max_distance.float()[:, None],
+            "max_distance": instances.unit.float()[:, None],
+        }
+        if not self.is_whole:
+            return plain
+        return {
+            **plain,
+            "uav_start": instances.uav_start.float().flatten(1),
+            "uav_end": instances.uav_end.float().flatten(1),
+            "uav_distance": instances.uav_distance.float(),
+            "service": instances.service_cost.float(),
         }

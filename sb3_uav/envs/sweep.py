@@ -13,12 +13,17 @@ def sweep_order(instances: Instances, gap: int = 0, clockwise: bool = False) -> 
     """
     Sort tasks by their polar angle around the depot, starting after a wide gap between two of them.
 
+    Where UAVs differ, the center is the mean of the points midway between their starts and ends.
+
     :param instances: ``batch`` instances
     :param gap: Rank of the gap to start after: 0 for the widest, 1 for the second widest, ...
     :param clockwise: Whether to sweep clockwise
     :return: ``(batch, n_tasks)`` int64, the index of the task in each place; padded tasks keep their places at the end
     """
-    offset = instances.tasks - instances.depot[:, None]
+    center = instances.depot
+    if instances.start is not None or instances.end is not None:
+        center = ((instances.uav_start + instances.uav_end) / 2).mean(1)
+    offset = instances.tasks - center[:, None]
     angle = th.atan2(offset[..., 1], offset[..., 0])
     angle, order = (-angle if clockwise else angle).masked_fill(~instances.task_mask, th.inf).sort(dim=1, stable=True)
     places = th.arange(instances.n_tasks, device=angle.device)

@@ -11,14 +11,14 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
-from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem
+from sb3_uav.envs.allocation import UNASSIGNED, AllocationProblem, allowed_uavs
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.sweep import sweep_order
 from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.encoder import feed_forward
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
-from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState
+from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry, FleetState, WholeFleetFeature
 from sb3_uav.policies.masked_policy import sample_actions
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
@@ -36,6 +36,12 @@ _INITIAL_SCORE = {
     FleetFeature.VOTES: 4.0,
     # Doubling the distance makes a UAV 2^0.5 times less likely: distance decides between UAVs with equal votes only.
     FleetFeature.RELATIVE_DISTANCE: -0.5,
+}
+# The same where UAVs differ.
+_INITIAL_WHOLE_SCORE = {
+    # A UAV for which the task is twice as far is 2^2 times less likely, and one that cannot reach it is out of the question.
+    WholeFleetFeature.RELATIVE_SOLO: -2.0,
+    WholeFleetFeature.TOO_FAR: -10.0,
 }
 
 
@@ -70,23 +76,28 @@ class _SharedScorer(nn.Module):
 
     :param embed_dim: Size of the embeddings
     :param geometry: Whether distances and loads are inputs
+    :param whole: Whether what differs between UAVs and the values are inputs too
     """
 
-    def __init__(self, embed_dim: int, geometry: bool) -> None:
+    def __init__(self, embed_dim: int, geometry: bool, whole: bool = False) -> None:
         super().__init__()
         self.project_task = nn.Linear(embed_dim, _SCORER_DIM)
         self.project_uav = nn.Linear(embed_dim, _SCORER_DIM, bias=False)
         self.project_fleet = nn.Linear(embed_dim, _SCORER_DIM, bias=False)
-        self.project_features = nn.Linear(len(FleetFeature), _SCORER_DIM, bias=False) if geometry else None
+        n_features = len(FleetFeature) + whole * len(WholeFleetFeature)
+        self.project_features = nn.Linear(n_features, _SCORER_DIM, bias=False) if geometry else None
         self.hidden = nn.Sequential(nn.ReLU(), nn.Linear(_SCORER_DIM, _SCORER_DIM), nn.ReLU())
         self.score = nn.Linear(_SCORER_DIM, 1)
-        self.direct = nn.Linear(len(FleetFeature), 1, bias=False) if geometry else None
+        self.direct = nn.Linear(n_features, 1, bias=False) if geometry else None
         if self.direct is not None:
             for parameter in (*self.direct.parameters(), *self.score.parameters()):
                 nn.init.zeros_(parameter)
             with th.no_grad():
                 for feature, weight in _INITIAL_SCORE.items():
                     self.direct.weight[0, feature] = weight
+                if whole:
+                    for difference, weight in _INITIAL_WHOLE_SCORE.items():
+                        self.direct.weight[0, len(FleetFeature) + difference] = weight
 
     def forward(self, context: th.Tensor, task: th.Tensor, features: th.Tensor | None) -> th.Tensor:
         """
@@ -127,7 +138,7 @@ class AllocatorExtractor(EpisodicExtractor):
         self.n_uavs = None if network.shared_scorer else n_uavs
         if network.shared_scorer:
             self.context_dim = embed_dim
-            self.scorer = _SharedScorer(embed_dim, network.geometry)
+            self.scorer = _SharedScorer(embed_dim, network.geometry, network.whole)
         else:
             self.project_context = nn.Linear(n_uavs * embed_dim, embed_dim)
             self.feed_forward = feed_forward(embed_dim, network.ff_dim)
@@ -135,7 +146,8 @@ class AllocatorExtractor(EpisodicExtractor):
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> AllocatorCache:
         if self.n_uavs is not None:
             return AllocatorCache(nodes)
-        return AllocatorCache(nodes, self.scorer.project_task(nodes), FleetGeometry.of(static) if self.geometry else None)
+        geometry = FleetGeometry.of(static, self.whole) if self.geometry else None
+        return AllocatorCache(nodes, self.scorer.project_task(nodes), geometry)
 
     def observed_state(self, cache: AllocatorCache, observation: TensorDict) -> AllocatorState:
         assignment, current_task = observation["assignment"], observation["current_task"].long().squeeze(-1)
@@ -246,8 +258,9 @@ class AllocatorPolicy(EpisodicPolicy):
 
     def _check_order(self, static: StaticObservation) -> None:
         """Warn if the tasks of the first observations are not in the order of a sweep."""
-        depot, tasks, values, max_distance = static.depot, static.tasks, static.values, static.max_distance[:, 0]
-        order = sweep_order(Instances(depot, tasks, values, max_distance, 1, static.task_mask))
+        n_uavs = 1 if static.start is None else static.start.shape[1]
+        shown = static.depot, static.tasks, static.values, static.max_distance[:, 0], n_uavs, static.task_mask
+        order = sweep_order(Instances(*shown, start=static.start, end=static.end))
         # Rounding of the observations may swap a few tasks.
         if (order == th.arange(order.shape[1], device=order.device)).float().mean() < 0.5:
             warnings.warn(
@@ -282,6 +295,7 @@ class AllocatorPolicy(EpisodicPolicy):
         geometry = cache.geometry
         fleet = None if geometry is None else geometry.initial(n_samples, n_uavs)
         uavs = th.arange(n_uavs, device=instances.device)
+        allowed = allowed_uavs(instances)
         actions = th.full((batch_size, n_samples, n_tasks), UNASSIGNED, device=instances.device)
         for step in range(n_tasks):
             task = th.full((batch_size, n_samples), step, device=instances.device)
@@ -289,6 +303,8 @@ class AllocatorPolicy(EpisodicPolicy):
             if geometry is not None and fleet is not None:
                 features = geometry.features(fleet, task, geometry.owners(task, actions))
             logits, _ = self.decode_step(cache, AllocatorState(context, task, features))
+            if allowed is not None:
+                logits = logits.masked_fill(~allowed[:, None, step], -th.inf)
             action = sample_actions(logits, deterministic, generator)
             actions[..., step] = action
             chosen = action[..., None, None].expand(-1, -1, 1, embed_dim)
@@ -311,7 +327,11 @@ class AllocatorPolicy(EpisodicPolicy):
         if geometry is not None:
             fleet = FleetState(*(field[:, :, :-1].flatten(1, 2) for field in geometry.of_prefixes(mine)))
             features = geometry.features(fleet, task, geometry.all_owners(actions))
-        action_mask = th.ones(1, 1, instances.n_uavs, dtype=th.bool, device=actions.device)
+        allowed = allowed_uavs(instances)
+        if allowed is None:
+            action_mask = th.ones(1, 1, instances.n_uavs, dtype=th.bool, device=actions.device)
+        else:
+            action_mask = allowed.repeat(1, n_samples, 1)
         return AllocatorState(context, task, features), action_mask
 
     def evaluate_episodes(self, instances: Instances, actions: th.Tensor, cache: Cache | None = None) -> Any:

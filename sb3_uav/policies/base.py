@@ -90,7 +90,20 @@ class EpisodicPolicy(MaskedPolicy):
         :param instances: ``batch`` instances on the device of the policy
         :return: Their encodings
         """
+        self.check_problem(instances)
         return self.features_extractor.encode(StaticObservation.from_instances(instances))
+
+    def check_problem(self, instances: Instances) -> None:
+        """
+        :param instances: Any instances
+        :raises ValueError: If they go beyond what the network sees
+        """
+        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        if beyond and not self.settings.whole:
+            raise ValueError(
+                f"This {type(self).__name__} sees only the paper's problem, but the instances have {', '.join(beyond)}; use "
+                "one with preset='whole'."
+            )
 
     def decode_step(self, cache: Cache, state: Any) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -8,10 +8,19 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_uav.policies.geometry import NodeFeature, node_features, scaled_coordinates
+from sb3_uav.policies.geometry import (
+    NodeFeature,
+    WholeDepotFeature,
+    WholeNodeFeature,
+    node_features,
+    scaled_coordinates,
+    whole_depot_features,
+    whole_node_features,
+)
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import is_recorded
+from sb3_uav.policies.world import World
 
 # The strongest preference for near nodes that a head starts with: e^-1 at 1/16 of the maximum flight distance.
 _LOCALITY = 256.0
@@ -251,8 +260,12 @@ class AttentionEncoder(nn.Module):
         self.use_values = settings.use_values
         self.relative = settings.relative
         # Relative to itself the depot has no position; what matters is how many tasks there are.
-        self.embed_depot = nn.Linear(1 if self.relative else 2, settings.embed_dim)
-        self.embed_task = nn.Linear((len(NodeFeature) if self.relative else 2) + self.use_values, settings.embed_dim)
+        self.whole = settings.whole
+        n_depot, n_task = (1, len(NodeFeature)) if self.relative else (2, 2)
+        if self.whole:
+            n_depot, n_task = n_depot + len(WholeDepotFeature), n_task + len(WholeNodeFeature)
+        self.embed_depot = nn.Linear(n_depot, settings.embed_dim)
+        self.embed_task = nn.Linear(n_task + self.use_values, settings.embed_dim)
         self.layers = AttentionLayers(settings)
 
     def forward(self, static: StaticObservation) -> th.Tensor:
@@ -265,6 +278,10 @@ class AttentionEncoder(nn.Module):
             coordinates = scaled_coordinates(static)
             depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - _TYPICAL_LOG_TASKS
             features = node_features(coordinates, static.task_mask)
+            if self.whole:
+                world = World.of(static)
+                depot = th.cat([depot, whole_depot_features(coordinates, static.task_mask, world)], dim=-1)
+                features = th.cat([features, whole_node_features(coordinates, static.task_mask, world)], dim=-1)
         if self.use_values:
             features = th.cat([features, static.values[..., None]], dim=-1)
         nodes = th.cat([self.embed_depot(depot)[:, None], self.embed_task(features)], dim=1)

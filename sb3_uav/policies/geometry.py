@@ -16,9 +16,12 @@ from torch.nn import functional
 
 from sb3_uav.envs.distances import euclidean
 from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.world import World
 
 # Beyond this nothing can be reached, so where exactly a task lies does not matter, nor does the magnitude of the numbers.
 FARTHEST = 1.0
+# The same for coordinates where UAVs start and end in different places, which may be far apart.
+_FARTHEST_APART = 8.0
 # Distances below this are as good as 0.
 NEAR = 1e-3
 # How many of the nearest tasks make up the density around a task.
@@ -41,6 +44,23 @@ NodeFeature = IntEnum(
 )
 
 
+# What networks with ``whole`` see of a task beside them: logarithm of its value relative to the mean; its value relative to
+# the greatest; service cost; distances from the nearest start and to the nearest end; which part of its maximum distance the
+# UAV that is best placed flies for it alone; which part of the UAVs could serve it; and how much value lies near it.
+WholeNodeFeature = IntEnum(
+    "WholeNodeFeature",
+    "LOG_VALUE VALUE SERVICE START END SOLO SERVED_BY RICHNESS",
+    start=0,
+)
+# And of the instance, beside the number of tasks: mean of the starts; mean length of the flights from start to end; mean of
+# the maximum distances; mean distance of the starts from their mean; spread of the values; and mean of the best SOLO.
+WholeDepotFeature = IntEnum(
+    "WholeDepotFeature",
+    "START_X START_Y OPEN REACH APART VALUE_SPREAD SOLO",
+    start=0,
+)
+
+
 FeatureT = TypeVar("FeatureT", bound=IntEnum)
 
 
@@ -57,10 +77,12 @@ def stack_features(kind: type[FeatureT], fields: Mapping[FeatureT, th.Tensor], l
 def scaled_coordinates(static: StaticObservation) -> th.Tensor:
     """
     :param static: ``batch`` instances
-    :return: ``(batch, n_tasks + 1, 2)``, depot first, relative to it; padded tasks lie in the depot
+    :return: ``(batch, n_tasks + 1, 2)``, home first (the depot, or where UAVs end, see :attr:`StaticObservation.home`),
+        relative to it; padded tasks lie there
     """
-    relative = (static.tasks - static.depot[:, None]) / static.max_distance[..., None]
-    tasks = relative.clamp(-FARTHEST, FARTHEST).masked_fill(~static.task_mask[..., None], 0.0)
+    relative = (static.tasks - static.home[:, None]) / static.max_distance[..., None]
+    farthest = FARTHEST if static.start is None and static.end is None else _FARTHEST_APART
+    tasks = relative.clamp(-farthest, farthest).masked_fill(~static.task_mask[..., None], 0.0)
     return th.cat([th.zeros_like(tasks[:, :1]), tasks], dim=1)
 
 
@@ -111,6 +133,59 @@ def node_features(coordinates: th.Tensor, task_mask: th.Tensor) -> th.Tensor:
         NodeFeature.DENSITY: density[..., 1],
     }
     return stack_features(NodeFeature, fields, home)
+
+
+def whole_node_features(coordinates: th.Tensor, task_mask: th.Tensor, world: World) -> th.Tensor:
+    """
+    Features of every task in the encoder of networks with ``whole``, beside :func:`node_features`.
+
+    :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
+    :param task_mask: ``(batch, n_tasks)`` bool
+    :param world: The rest of the instances
+    :return: ``(batch, n_tasks, len(WholeNodeFeature))``
+    """
+    tasks = coordinates[:, 1:]
+    start, end = (euclidean(tasks[:, None], points[:, :, None]).amin(1) for points in (world.start, world.end))
+    solo = world.solo(tasks)
+    distance = task_distances(coordinates, task_mask)
+    near, neighbors = distance.topk(min(_N_DENSITY, distance.shape[-1]), largest=False)
+    value = world.value.gather(1, neighbors.flatten(1)).view_as(near).masked_fill(near >= FARTHEST, 0.0)
+    fields = {
+        WholeNodeFeature.LOG_VALUE: world.log_value,
+        WholeNodeFeature.VALUE: world.value / world.value.amax(1, keepdim=True).clamp(min=NEAR),
+        WholeNodeFeature.SERVICE: SHORT_SCALE * world.service,
+        WholeNodeFeature.START: FAR_SCALE * start,
+        WholeNodeFeature.END: FAR_SCALE * end,
+        WholeNodeFeature.SOLO: solo.amin(1),
+        WholeNodeFeature.SERVED_BY: (solo <= 1).to(start.dtype).mean(1),
+        WholeNodeFeature.RICHNESS: (value.mean(-1) + world.value + NEAR).log().clamp(min=-LOG_RATIO_LIMIT),
+    }
+    return stack_features(WholeNodeFeature, fields, start)
+
+
+def whole_depot_features(coordinates: th.Tensor, task_mask: th.Tensor, world: World) -> th.Tensor:
+    """
+    Features of the instance in the encoder of networks with ``whole``.
+
+    :param coordinates: ``(batch, n_tasks + 1, 2)``, see :func:`scaled_coordinates`
+    :param task_mask: ``(batch, n_tasks)`` bool
+    :param world: The rest of the instances
+    :return: ``(batch, len(WholeDepotFeature))``
+    """
+    n_real = task_mask.sum(1).clamp(min=1)
+    start = world.start.mean(1)
+    solo = world.solo(coordinates[:, 1:]).amin(1).masked_fill(~task_mask, 0.0).sum(1) / n_real
+    spread = (world.log_value**2).masked_fill(~task_mask, 0.0).sum(1) / n_real
+    fields = {
+        WholeDepotFeature.START_X: FAR_SCALE * start[:, 0],
+        WholeDepotFeature.START_Y: FAR_SCALE * start[:, 1],
+        WholeDepotFeature.OPEN: FAR_SCALE * euclidean(world.start, world.end).mean(1),
+        WholeDepotFeature.REACH: world.reach.mean(1),
+        WholeDepotFeature.APART: FAR_SCALE * euclidean(world.start, start[:, None]).mean(1),
+        WholeDepotFeature.VALUE_SPREAD: (spread + NEAR).sqrt(),
+        WholeDepotFeature.SOLO: solo,
+    }
+    return stack_features(WholeDepotFeature, fields, solo)
 
 
 def log_ratio(a: th.Tensor, b: th.Tensor) -> th.Tensor:

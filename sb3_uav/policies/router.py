@@ -19,7 +19,7 @@ from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.encoder import attend
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
 from sb3_uav.policies.masked_policy import sample_actions
-from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
+from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry, WholeMoveFeature
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.torch_state import float32_on_cpu
@@ -29,6 +29,8 @@ _LOGIT_CLIP = 10.0
 # What the compatibilities get from the geometry of a move before training: twice as far away is 2^4 times less likely. Tours
 # then begin as those of a randomized nearest neighbor search.
 _INITIAL_SCORE = {MoveFeature.RELATIVE_DISTANCE: -4.0}
+# The same with values: what counts is value per length.
+_INITIAL_WHOLE_SCORE = {WholeMoveFeature.WORTH: 4.0}
 # Number of chunks, by size, into which subsets are split before they are padded.
 _SIZE_CLASSES = 2
 
@@ -77,21 +79,29 @@ class _MoveBias(nn.Module):
     :param bias_dim: Hidden size
     :param n_scores: Number of scores of a move
     :param mixed_precision: Whether the hidden layer computes in bfloat16: a third to a quarter of the time on CPUs with AMX
+    :param whole: Whether there are values and service costs among the features
     """
 
-    def __init__(self, embed_dim: int, bias_dim: int, n_scores: int, mixed_precision: bool = False) -> None:
+    def __init__(
+        self, embed_dim: int, bias_dim: int, n_scores: int, mixed_precision: bool = False, whole: bool = False
+    ) -> None:
         super().__init__()
         self.mixed_precision = mixed_precision
-        self.linear = nn.Linear(len(MoveFeature), n_scores)
-        self.project_features = nn.Linear(len(MoveFeature), bias_dim)
+        n_features = len(MoveFeature) + whole * len(WholeMoveFeature)
+        self.linear = nn.Linear(n_features, n_scores)
+        self.project_features = nn.Linear(n_features, bias_dim)
         self.project_node = nn.Linear(embed_dim, bias_dim, bias=False)
         self.project_query = nn.Linear(embed_dim, bias_dim, bias=False)
         self.score = nn.Linear(bias_dim, n_scores)
         for parameter in (*self.linear.parameters(), *self.score.parameters()):
             nn.init.zeros_(parameter)
         with th.no_grad():
-            for feature, weight in _INITIAL_SCORE.items():
-                self.linear.weight[-1, feature] = weight
+            if whole:
+                for worth, weight in _INITIAL_WHOLE_SCORE.items():
+                    self.linear.weight[-1, len(MoveFeature) + worth] = weight
+            else:
+                for feature, weight in _INITIAL_SCORE.items():
+                    self.linear.weight[-1, feature] = weight
 
     def forward(self, features: th.Tensor, nodes: th.Tensor, query: th.Tensor) -> th.Tensor:
         """
@@ -135,7 +145,9 @@ class RouterExtractor(EpisodicExtractor):
         self.scaled = network.relative or network.geometry
         # One score for each head of the glimpse and one for the compatibilities.
         self.move_bias = (
-            _MoveBias(embed_dim, network.bias_dim, n_heads + 1, network.mixed_precision) if network.geometry else None
+            _MoveBias(embed_dim, network.bias_dim, n_heads + 1, network.mixed_precision, network.whole)
+            if network.geometry
+            else None
         )
 
     def precompute(self, nodes: th.Tensor, static: StaticObservation) -> RouterCache:
@@ -150,7 +162,7 @@ class RouterExtractor(EpisodicExtractor):
             logit_key=logit_key,
             unit=static.max_distance if self.scaled else th.ones_like(static.max_distance),
             bias_nodes=None if self.move_bias is None else self.move_bias.project_node(nodes),
-            geometry=None if self.move_bias is None else MoveGeometry.of(static),
+            geometry=None if self.move_bias is None else MoveGeometry.of(static, self.whole),
         )
 
     def observed_state(self, cache: RouterCache, observation: TensorDict) -> RouterState:
@@ -193,6 +205,9 @@ class RouterPolicy(EpisodicPolicy):
     def placeholder_spaces(cls, n_actions: int | None) -> tuple[spaces.Dict, spaces.Discrete]:
         problem = RoutingProblem(UniformGenerator(n_tasks=1, n_uavs=1))
         return problem.observation_space, problem.action_space
+
+    def encode(self, instances: Instances) -> Cache:
+        return super().encode(instances.with_fleet(1))
 
     @staticmethod
     def _decoder_state(dynamics: RoutingDynamics, state: RoutingState) -> RouterState:

@@ -30,6 +30,8 @@ class NetworkSettings:
     :param bias_dim: Hidden size of the layer that scores the geometry of a move (router)
     :param shared_scorer: Whether one scorer rates all UAVs, so that the network serves fleets of any size (allocator)
     :param sweep: Whether tasks are allocated in the order of :func:`~sb3_uav.envs.sweep.sweep_order` (allocator)
+    :param whole: Whether the network sees the whole problem: each UAV's start, end and maximum distance, service costs, and
+        values relative to those of the instance. It needs ``relative``, ``geometry`` and ``shared_scorer``
     :param mixed_precision: Whether encoders and the router's move bias compute in bfloat16 where that is safe
     """
 
@@ -44,6 +46,7 @@ class NetworkSettings:
     bias_dim: int = 32
     shared_scorer: bool = False
     sweep: bool = False
+    whole: bool = False
     mixed_precision: bool = False
 
     def __post_init__(self) -> None:
@@ -55,6 +58,9 @@ class NetworkSettings:
                 raise ValueError(f"{name} is {value!r}; give a whole number, at least {least}.")
         if self.embed_dim % self.n_heads != 0:
             raise ValueError(f"embed_dim {self.embed_dim} must be a multiple of n_heads {self.n_heads}.")
+        lacking = [name for name in ("relative", "geometry", "shared_scorer") if self.whole and not getattr(self, name)]
+        if lacking:
+            raise ValueError(f"whole=True needs {' and '.join(f'{name}=True' for name in lacking)}.")
 
     @classmethod
     def of(cls, settings: dict[str, Any], preset: str | None = None) -> NetworkSettings:
@@ -75,11 +81,12 @@ class NetworkSettings:
         return replace(cls() if preset is None else _PRESETS[preset], **given)
 
 
+# One network for every number of tasks and UAVs and every maximum flight distance.
+_DEFAULT = NetworkSettings(embed_dim=64, n_heads=4, ff_dim=256, relative=True, geometry=True, shared_scorer=True, sweep=True)
 _PRESETS: dict[str, NetworkSettings] = {
-    # One network for every number of tasks and UAVs and every maximum flight distance.
-    "default": NetworkSettings(
-        embed_dim=64, n_heads=4, ff_dim=256, relative=True, geometry=True, shared_scorer=True, sweep=True
-    ),
+    "default": _DEFAULT,
+    # The same for the whole problem. Values enter relative to those of the instance.
+    "whole": replace(_DEFAULT, whole=True, use_values=False),
     # Section IV-A2 of the paper.
     "paper": NetworkSettings(normalization="batch", use_values=False),
 }

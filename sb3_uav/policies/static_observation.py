@@ -14,11 +14,17 @@ class StaticObservation(NamedTuple):
     """
     The static part of ``batch`` observations, float32 on the network's device.
 
+    Fields of the whole problem are None where every row has their defaults.
+
     :param depot: ``(batch, 2)``
     :param tasks: ``(batch, n_tasks, 2)``
-    :param values: ``(batch, n_tasks)``
+    :param values: ``(batch, n_tasks)``, see :attr:`~sb3_uav.envs.instances.Instances.prizes`
     :param task_mask: ``(batch, n_tasks)`` bool, True for real tasks
-    :param max_distance: ``(batch, 1)``
+    :param max_distance: ``(batch, 1)``, that of the UAV that flies farthest
+    :param start: ``(batch, n_uavs, 2)``
+    :param end: ``(batch, n_uavs, 2)``
+    :param uav_distance: ``(batch, n_uavs)``
+    :param service: ``(batch, n_tasks)``
     """
 
     depot: th.Tensor
@@ -26,26 +32,50 @@ class StaticObservation(NamedTuple):
     values: th.Tensor
     task_mask: th.Tensor
     max_distance: th.Tensor
+    start: th.Tensor | None = None
+    end: th.Tensor | None = None
+    uav_distance: th.Tensor | None = None
+    service: th.Tensor | None = None
 
     @classmethod
     def from_observation(cls, observation: TensorDict) -> StaticObservation:
         """:param observation: A batch of preprocessed observations"""
+        whole = {}
+        if "uav_distance" in observation:
+            whole = {
+                "start": observation["uav_start"].unflatten(1, (-1, 2)),
+                "end": observation["uav_end"].unflatten(1, (-1, 2)),
+                "uav_distance": observation["uav_distance"],
+                "service": observation["service"],
+            }
         return cls(
             depot=observation["depot"],
             tasks=observation["tasks"].unflatten(1, (-1, 2)),
             values=observation["task_values"],
             task_mask=observation["task_mask"].bool(),
             max_distance=observation["max_distance"],
+            **whole,
         )
 
     @classmethod
     def from_instances(cls, instances: Instances) -> StaticObservation:
         """:param instances: Instances on the network's device"""
         instances = instances.near_origin()
+        # That of a single UAV may be 0, and is a unit.
+        unit = instances.unit.float()[:, None]
         return cls(
             depot=instances.depot.float(),
             tasks=instances.tasks.float(),
-            values=instances.values.float(),
+            values=instances.prizes.float(),
             task_mask=instances.task_mask,
-            max_distance=instances.max_distance.float()[:, None],
+            max_distance=unit.where(unit > 0, 1.0),
+            start=None if instances.start is None else instances.start.float(),
+            end=None if instances.end is None else instances.end.float(),
+            uav_distance=None if instances.max_distance.dim() == 1 else instances.max_distance.float(),
+            service=None if instances.service is None else instances.service.float(),
         )
+
+    @property
+    def home(self) -> th.Tensor:
+        """The origin of the networks' coordinates: the mean of the UAVs' ends, ``(batch, 2)``."""
+        return self.depot if self.end is None else self.end.mean(1)
