@@ -60,6 +60,7 @@ def test_policy_save_and_load_keep_every_argument(level, tmp_path):
         bias_dim=9,
         shared_scorer=True,
         sweep=True,
+        whole=True,
         mixed_precision=True,
         net_arch=dict(pi=[], vf=[8]),
         activation_fn=nn.ReLU,
@@ -217,7 +218,7 @@ def test_unknown_settings_are_named(level):
     with pytest.raises(TypeError, match=r"unexpected keyword arguments \['wings'\]"):
         extractor(policy.observation_space, **SMALL, wings=2)
     extractor(policy.observation_space, **{**asdict(NetworkSettings()), **SMALL})
-    assert len(fields(NetworkSettings)) == 12
+    assert len(fields(NetworkSettings)) == 13
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -275,7 +275,7 @@ class AttentionEncoder(nn.Module):
         """
         depot, features, coordinates = static.depot, static.tasks, None
         if self.relative:
-            coordinates = scaled_coordinates(static)
+            coordinates = scaled_coordinates(static, self.whole)
             depot = static.task_mask.sum(1, keepdim=True).clamp(min=1).to(features.dtype).log() - _TYPICAL_LOG_TASKS
             features = node_features(coordinates, static.task_mask)
             if self.whole:

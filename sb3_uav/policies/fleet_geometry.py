@@ -20,12 +20,14 @@ from sb3_uav.policies.geometry import (
     task_distances,
 )
 from sb3_uav.policies.static_observation import StaticObservation
-from sb3_uav.policies.world import World
+from sb3_uav.policies.world import LONGEST_SOLO, World
 
 # How many of the nearest earlier tasks count as the neighbors of a task.
 _N_NEIGHBORS = 8
 # Fraction of its share of the tasks from which a UAV counts as full.
 _FULL = 0.95
+# A UAV that can serve nothing counts as if it flew this part of the mean distance, so that its load stays a moderate number.
+_LEAST_CAPACITY = 0.1
 # Logarithm of about 20, a common number of tasks per UAV.
 LOG_TASKS_PER_UAV_OFFSET = 3.0
 
@@ -113,13 +115,15 @@ class FleetGeometry(NamedTuple):
         :param static: ``batch`` instances
         :param whole: Whether to add what the whole problem takes
         """
-        coordinates = scaled_coordinates(static)
+        coordinates = scaled_coordinates(static, whole)
         n_tasks = static.task_mask.shape[1]
         later = th.ones(n_tasks, n_tasks, dtype=th.bool, device=coordinates.device).triu()
         distance = task_distances(coordinates, static.task_mask).masked_fill(later, 2 * FARTHEST)
         near, neighbors = distance.topk(min(_N_NEIGHBORS, n_tasks), largest=False)
         world = World.of(static) if whole else None
-        solo = None if world is None else world.solo(coordinates[:, 1:])
+        solo = None
+        if world is not None:
+            solo = world.solo(coordinates[:, 1:]).masked_fill(~static.task_mask[:, None], LONGEST_SOLO)
         n_real = static.task_mask.sum(1, keepdim=True).clamp(min=1).float()
         return cls(coordinates, neighbors, near, n_real, world, solo)
 
@@ -276,7 +280,7 @@ class FleetGeometry(NamedTuple):
         """:return: ``(batch, n_uavs or 1)``, how far each UAV flies relative to the mean; nearly 0 if it can serve nothing"""
         assert self.world is not None and self.solo is not None
         able = self.world.reach * (self.solo <= 1).any(-1)
-        return (able / able.mean(1, keepdim=True).clamp(min=NEAR)).clamp(min=NEAR)
+        return (able / able.mean(1, keepdim=True).clamp(min=NEAR)).clamp(min=_LEAST_CAPACITY)
 
     def _whole_features(self, fleet: FleetState, task: th.Tensor, point: th.Tensor) -> th.Tensor:
         """

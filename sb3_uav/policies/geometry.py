@@ -20,7 +20,7 @@ from sb3_uav.policies.world import World
 
 # Beyond this nothing can be reached, so where exactly a task lies does not matter, nor does the magnitude of the numbers.
 FARTHEST = 1.0
-# The same for coordinates where UAVs start and end in different places, which may be far apart.
+# The same for coordinates in networks with ``whole``, because UAVs may start and end far apart.
 _FARTHEST_APART = 8.0
 # Distances below this are as good as 0.
 NEAR = 1e-3
@@ -74,14 +74,15 @@ def stack_features(kind: type[FeatureT], fields: Mapping[FeatureT, th.Tensor], l
     return th.stack([fields[feature].expand_as(like) for feature in kind], dim=-1)
 
 
-def scaled_coordinates(static: StaticObservation) -> th.Tensor:
+def scaled_coordinates(static: StaticObservation, whole: bool = False) -> th.Tensor:
     """
     :param static: ``batch`` instances
+    :param whole: Whether they are for a network that sees the whole problem
     :return: ``(batch, n_tasks + 1, 2)``, home first (the depot, or where UAVs end, see :attr:`StaticObservation.home`),
         relative to it; padded tasks lie there
     """
     relative = (static.tasks - static.home[:, None]) / static.max_distance[..., None]
-    farthest = FARTHEST if static.start is None and static.end is None else _FARTHEST_APART
+    farthest = _FARTHEST_APART if whole else FARTHEST
     tasks = relative.clamp(-farthest, farthest).masked_fill(~static.task_mask[..., None], 0.0)
     return th.cat([th.zeros_like(tasks[:, :1]), tasks], dim=1)
 

@@ -173,7 +173,7 @@ class MoveGeometry(NamedTuple):
         :param static: ``batch`` instances
         :param whole: Whether to add what the whole problem takes
         """
-        coordinates = scaled_coordinates(static)
+        coordinates = scaled_coordinates(static, whole)
         distance = task_distances(coordinates, static.task_mask)
         near, neighbors = distance.topk(min(N_NEXT, distance.shape[1]), largest=False)
         home = th.linalg.vector_norm(coordinates, dim=-1)

@@ -78,4 +78,7 @@ class StaticObservation(NamedTuple):
     @property
     def home(self) -> th.Tensor:
         """The origin of the networks' coordinates: the mean of the UAVs' ends, ``(batch, 2)``."""
-        return self.depot if self.end is None else self.end.mean(1)
+        if self.end is None:
+            return self.depot
+        # Exact where all are equal.
+        return self.end[:, 0] + (self.end - self.end[:, :1]).mean(1)

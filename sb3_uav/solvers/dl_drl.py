@@ -62,6 +62,7 @@ class DLDRL(BatchedSolver):
         self.allocator = allocator
         self.router = router
         self.serves_any_fleet = allocator.n_uavs is None
+        self.solves_whole_problem = allocator.settings.whole and router.settings.whole
         self.decode = decode
         self.samples = samples
         self.refinement = Refinement(repair, polish)
