@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instance_helpers import assert_equal
 
+from sb3_uav.distributions.layouts import DEPOTS, LAYOUTS
+from sb3_uav.distributions.task_values import VALUES
 from sb3_uav.envs import Instances, TaskAllocationEnv, WorldGenerator, nearest_feasible
 from sb3_uav.envs.compaction import compact
-from sb3_uav.envs.layouts import DEPOTS, LAYOUTS
-from sb3_uav.envs.task_values import VALUES
 from sb3_uav.envs.world import SERVICES, SITES, _curve_length
 
 

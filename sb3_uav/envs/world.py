@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_uav.distributions.layouts import DEPOTS, LAYOUTS, draw_depots, draw_tasks, log_uniform, places_among
+from sb3_uav.distributions.task_values import VALUES, draw_values
 from sb3_uav.envs.compaction import compact
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.layouts import DEPOTS, LAYOUTS, draw_depots, draw_tasks, log_uniform, places_among
 from sb3_uav.envs.sizes import check_size, n_instances_of
-from sb3_uav.envs.task_values import VALUES, draw_values
 
 # Where UAVs start and end, and how often where fleets may differ from the paper's: in the depot; each in one of several
 # depots; in the depot, and in other places; anywhere in the air, with a part of the range left, and in the depot.
@@ -50,9 +50,9 @@ class Kinds(NamedTuple):
     """
     What was drawn for each row; every array is ``(batch,)``.
 
-    :param layout: Names of :data:`~sb3_uav.envs.layouts.LAYOUTS`
-    :param depot: Names of :data:`~sb3_uav.envs.layouts.DEPOTS`
-    :param values: Names of :data:`~sb3_uav.envs.task_values.VALUES`
+    :param layout: Names of :data:`~sb3_uav.distributions.layouts.LAYOUTS`
+    :param depot: Names of :data:`~sb3_uav.distributions.layouts.DEPOTS`
+    :param values: Names of :data:`~sb3_uav.distributions.task_values.VALUES`
     :param site: Names of :data:`SITES`
     :param service: Names of :data:`SERVICES`
     :param unequal: bool, whether ranges differ
