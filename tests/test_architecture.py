@@ -13,6 +13,7 @@ PACKAGE = ROOT / "sb3_uav"
 # From the lowest to the highest. A room may import those before it.
 ROOMS = (
     "common",
+    "distributions",
     "envs",
     "registration",
     "local_search",

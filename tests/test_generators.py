@@ -109,5 +109,7 @@ def test_make_generator(tmp_path: Path, small: Instances) -> None:
         fixed = make_generator(99, 99, instances=source)
         assert isinstance(fixed, FixedGenerator)
         assert_equal(fixed.instances, small)
-    with pytest.raises(ValueError, match=r"distribution is 'gaussian'; choose one of \['clustered', 'mixture', 'uniform'\]"):
+    with pytest.raises(
+        ValueError, match=r"distribution is 'gaussian'; choose one of \['clustered', 'mixture', 'uniform', 'world'\]"
+    ):
         make_generator(6, 2, distribution="gaussian")

@@ -10,10 +10,19 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch as th
+from instance_helpers import assert_equal
 from solver_helpers import make_policy
 
-from sb3_uav.envs import BatchedVecEnv, TaskAllocationEnv, UniformGenerator, check_schedule, nearest_feasible, schedules
-from sb3_uav.envs.allocation import plan_tours
+from sb3_uav.envs import (
+    BatchedVecEnv,
+    TaskAllocationEnv,
+    UniformGenerator,
+    WorldGenerator,
+    check_schedule,
+    nearest_feasible,
+    schedules,
+)
+from sb3_uav.envs.allocation import plan_tours, split_tasks
 from sb3_uav.envs.generators import MixtureGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
@@ -23,6 +32,7 @@ from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, WARM_START_FOLDER
 pytest.importorskip("numba")
 from sb3_uav.training import imitation
 from sb3_uav.training.imitation import Lesson, _search_lessons, _varied, good_tours, imitate
+from sb3_uav.training.imitation_progress import ImitationProgress
 
 WARM_START: dict[str, Any] = {"n_subsets": 40, "n_updates": 4, "batch_size": 8}
 
@@ -205,6 +215,39 @@ def test_variants_are_the_same_tours(allocator: Any) -> None:
         for row in range(len(variant.tours)):
             length = tour_length(variant, row)
             assert any(length == pytest.approx(tour_length(lesson, other), abs=1e-6) for other in range(len(lesson.tours)))
+
+
+def whole_lesson() -> Lesson:
+    """Feasible tours from a start to another end, with service costs."""
+    fleets = WorldGenerator(12, 3, whole_share=1.0)(20, np.random.default_rng(0))
+    assert fleets.start is not None and fleets.end is not None and fleets.service is not None
+    everything = th.arange(12).expand(20, 1, -1) % 3
+    subsets = split_tasks(fleets, everything).instances
+    return Lesson(subsets, nearest_feasible(subsets))
+
+
+def test_tours_flown_backwards_begin_at_the_end() -> None:
+    lesson = whole_lesson()
+    variant = _varied(lesson, np.random.default_rng(1), 64)
+    assert not th.equal(variant.instances.uav_start, lesson.instances.uav_start)
+    for row, schedule in enumerate(schedules(variant.tours[:, None] - 1)):
+        check_schedule(variant.instances, row, schedule)
+
+
+def test_progress_keeps_the_whole_problem(tmp_path: Path) -> None:
+    lesson, rng = whole_lesson(), np.random.default_rng(0)
+    ImitationProgress(tmp_path, {}).save_lessons([lesson], rng)
+    (restored,) = ImitationProgress(tmp_path, {}).restore_lessons(rng)
+    assert_equal(restored.instances, lesson.instances)
+    assert th.equal(restored.tours, lesson.tours)
+
+
+def test_a_router_learns_from_maps_of_all_kinds(allocator: Any) -> None:
+    router = make_policy(RouterPolicy)
+    before = parameters(router)
+    generator = WorldGenerator(40, 4, whole_share=0.0)
+    imitate(router, allocator, generator, np.random.default_rng(3), 40, 3, 8)
+    assert not th.equal(parameters(router), before) and parameters(router).isfinite().all()
 
 
 def tour_length(lesson: Lesson, row: int) -> float:

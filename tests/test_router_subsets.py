@@ -13,6 +13,7 @@ from sb3_uav.envs import (
     MixtureGenerator,
     TaskAllocationEnv,
     UniformGenerator,
+    WorldGenerator,
 )
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce import REINFORCE
@@ -85,18 +86,21 @@ def test_pretraining_instances_are_whole():
     assert th.equal(drawn.tasks, UniformGenerator(6, 4, 1.5)(3, np.random.default_rng(0)).tasks)
 
 
-def make_mixture() -> tuple[AllocatedSubsets, Any]:
+MIXTURE = MixtureGenerator(60, 3, min_tasks=24)
+
+
+def make_mixture(generator: Any = MIXTURE) -> tuple[AllocatedSubsets, Any]:
     env = BatchedVecEnv([lambda: TaskAllocationEnv(60, 3, distribution="mixture")] * 8)
     model: Any = REINFORCE(AllocatorPolicy, env, seed=0, device="cpu", policy_kwargs=SMALL, instances_per_epoch=8)
-    generator = MixtureGenerator(60, 3, min_tasks=24)
     env.set_generator(generator)
     stream = np.random.default_rng
     return AllocatedSubsets(model.policy, generator, model.draw_batch, range(5), 1.0, lambda chunk: stream(chunk)), model
 
 
-def test_mixed_subsets_come_from_one_batch_each():
+@pytest.mark.parametrize("generator", [MIXTURE, WorldGenerator(60, 3, min_tasks=24, whole_share=0.0)])
+def test_mixed_subsets_come_from_one_batch_each(generator):
     """So that small ones are not padded to large ones; of small ones there are more."""
-    subsets, model = make_mixture()
+    subsets, model = make_mixture(generator)
     batches = [model.draw_batch(i) for i in range(5)]
     assert len({(batch.n_tasks, batch.n_uavs) for batch in batches}) > 1
     rng = np.random.default_rng(0)

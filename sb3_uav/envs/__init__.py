@@ -4,6 +4,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv, Router, RoutingProblem, collected_value, nearest_feasible
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, ScheduleReport, check_schedule
 from sb3_uav.envs.vec_env import BatchedVecEnv
+from sb3_uav.envs.world import WorldGenerator
 
 __all__ = [
     "AllocationProblem",
@@ -21,6 +22,7 @@ __all__ = [
     "ScheduleReport",
     "TaskAllocationEnv",
     "UniformGenerator",
+    "WorldGenerator",
     "check_schedule",
     "collected_value",
     "nearest_feasible",

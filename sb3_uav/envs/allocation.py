@@ -335,7 +335,7 @@ class TaskAllocationEnv(ProblemEnv):
     :param n_tasks: Number of tasks
     :param n_uavs: Number of UAVs
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, or a function of the user
+    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, ``"world"``, or a function of the user
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances, or what makes it
     :param router: Plans the tours of the reward: a function, a zip, or the name of a trained pair; nearest feasible task when

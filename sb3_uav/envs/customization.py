@@ -48,9 +48,10 @@ from sb3_uav.envs.generators import (
 )
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.rewards import Reward
+from sb3_uav.envs.world import WorldGenerator
 
 _N_TRIED = 2
-_STATELESS = (UniformGenerator, ClusteredGenerator, MixtureGenerator, FixedGenerator)
+_STATELESS = (UniformGenerator, ClusteredGenerator, MixtureGenerator, WorldGenerator, FixedGenerator)
 _PATH_ADVICE = "give the dotted path of one that can be imported from here"
 
 

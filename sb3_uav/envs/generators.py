@@ -10,7 +10,9 @@ from typing import Protocol
 import numpy as np
 import torch as th
 
-from sb3_uav.envs.instances import MAX_UAVS, Instances
+from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.sizes import check_size, n_instances_of
+from sb3_uav.envs.world import WorldGenerator
 
 
 class InstanceGenerator(Protocol):
@@ -37,21 +39,6 @@ def goes_beyond_the_paper(generator: InstanceGenerator) -> bool:
     :return: Whether its instances may have starts, ends and distances of each UAV, or service costs
     """
     return bool(getattr(generator, "beyond_the_paper", False))
-
-
-def _check_size(n_tasks: int, n_uavs: int, max_distance: float) -> None:
-    """
-    :param n_tasks: Number of tasks
-    :param n_uavs: Number of UAVs
-    :param max_distance: Maximum flight distance
-    :raises ValueError: If a size is not allowed; the message names it
-    """
-    if n_tasks < 1:
-        raise ValueError(f"n_tasks is {n_tasks}, but an instance needs at least 1 task.")
-    if not 1 <= n_uavs <= MAX_UAVS:
-        raise ValueError(f"n_uavs is {n_uavs}, but a fleet needs at least 1 UAV, and {MAX_UAVS} at most.")
-    if not (np.isfinite(max_distance) and max_distance > 0):
-        raise ValueError(f"max_distance is {max_distance}, but the maximum flight distance must be a finite number > 0.")
 
 
 def _with_unit_values(depot: np.ndarray, tasks: np.ndarray, max_distance: float, n_uavs: int) -> Instances:
@@ -82,7 +69,7 @@ class UniformGenerator:
     max_distance: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         points = rng.random((batch_size, self.n_tasks + 1, 2))
@@ -109,7 +96,7 @@ class ClusteredGenerator:
     spread: float = 0.07
 
     def __post_init__(self) -> None:
-        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
         if self.n_clusters < 1 or not self.spread >= 0:
             raise ValueError(f"n_clusters must be >= 1 and spread >= 0, found {self.n_clusters} and {self.spread}.")
 
@@ -126,9 +113,6 @@ class ClusteredGenerator:
 _TASKS_PER_UAV = 12
 # Exponent that favors small instances, which are almost as instructive as large ones and cheaper; 1 is log-uniform.
 _SMALL_SIZES = 1.5
-# Exponent that reduces the batch size of larger instances. With 1, all batches would hold equally many tasks; less than that
-# is better, because small tensors spend more time on launching operations.
-_FEWER_INSTANCES = 0.85
 
 
 @dataclass(frozen=True)
@@ -152,7 +136,7 @@ class MixtureGenerator:
     min_tasks: int = 40
 
     def __post_init__(self) -> None:
-        _check_size(self.n_tasks, self.n_uavs, self.max_distance)
+        check_size(self.n_tasks, self.n_uavs, self.max_distance)
         if self.min_tasks < 1:
             raise ValueError(f"min_tasks is {self.min_tasks}; give at least 1.")
 
@@ -170,7 +154,7 @@ class MixtureGenerator:
         fewest = min(max(least, _TASKS_PER_UAV * n_uavs), self.n_tasks)
         n_tasks = round(fewest * (self.n_tasks / fewest) ** (rng.random() ** _SMALL_SIZES))
         factor = 1.0 if rng.random() < 0.5 else rng.uniform(0.6, 1.6)
-        n_instances = max(round(batch_size * (least / n_tasks) ** _FEWER_INSTANCES), 2)
+        n_instances = n_instances_of(batch_size, least, n_tasks)
         return UniformGenerator(n_tasks, n_uavs, self.max_distance * factor)(n_instances, rng)
 
 
@@ -234,7 +218,12 @@ class FixedGenerator:
         return self.instances[rng.integers(len(self.instances), size=batch_size)]
 
 
-_GENERATORS = {"uniform": UniformGenerator, "clustered": ClusteredGenerator, "mixture": MixtureGenerator}
+_GENERATORS = {
+    "uniform": UniformGenerator,
+    "clustered": ClusteredGenerator,
+    "mixture": MixtureGenerator,
+    "world": WorldGenerator,
+}
 
 
 def make_generator(
@@ -250,7 +239,7 @@ def make_generator(
     :param n_tasks: Number of tasks; ignored when ``instances`` is given
     :param n_uavs: Number of UAVs; ignored when ``instances`` is given
     :param max_distance: Maximum flight distance; ignored when ``instances`` is given
-    :param distribution: ``"uniform"``, ``"clustered"`` or ``"mixture"``
+    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"`` or ``"world"``
     :param instances: Instances, or the path of an ``.npz`` file, to draw from instead of a distribution
     :raises ValueError: If an argument is not allowed
     """

@@ -225,7 +225,7 @@ class RoutePlanningEnv(ProblemEnv):
 
     :param n_tasks: Number of tasks
     :param max_distance: Maximum flight distance
-    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, or a function of the user
+    :param distribution: ``"uniform"``, ``"clustered"``, ``"mixture"``, ``"world"``, or a function of the user
     :param instances: Path of an ``.npz`` file, or ``Instances``, to draw from instead
     :param generator: Any other source of instances, or what makes it
     :param render_mode: ``"human"``, ``"rgb_array"`` or None

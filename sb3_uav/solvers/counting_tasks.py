@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch as th
 
+from sb3_uav.envs.compaction import compact
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 
@@ -44,18 +45,7 @@ class CountingTasks:
         if th.equal(counts, instances.task_mask):
             index = th.arange(instances.n_tasks, device=instances.device).expand(len(instances), -1)
             return cls(original, instances, index)
-        index = (~counts).long().argsort(dim=1, stable=True)
-        task_mask = counts.gather(1, index)
-        # A row in which no task counts keeps one padded slot.
-        n_slots = max(int(task_mask.sum(1).max()), 1)
-        arranged = replace(instances.reorder(index), task_mask=task_mask).trim(n_slots)
-        padded = ~arranged.task_mask
-        compact = replace(
-            arranged,
-            tasks=th.where(padded[..., None], arranged.depot[:, None], arranged.tasks),
-            values=arranged.values.masked_fill(padded, 0.0),
-        )
-        return cls(original, compact, index[:, :n_slots])
+        return cls(original, *compact(instances, counts))
 
     def n_useful_uavs(self) -> list[int]:
         """:return: How many UAVs of each instance can be of use: of equal ones at most one per task, and at least one"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def imitate(
 
     :param router: The policy to train, in place
     :param allocator: Splits the tasks
-    :param generator: Draws the instances; all task values should be equal, because the tours visit as many tasks as possible
+    :param generator: Draws the instances
     :param rng: Random generator for everything that is drawn
     :param n_subsets: Number of subsets to search tours for
     :param n_updates: Number of gradient steps; the learning rate warms up, then follows a cosine
@@ -172,7 +173,8 @@ def _varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson
     :param lesson: Subsets and tours
     :param rng: Random generator
     :param batch_size: As for :func:`imitate`
-    :return: A random selection, about half of the tours reversed, each instance rotated around its depot
+    :return: A random selection, about half of the tours flown backwards, from end to start; each instance rotated around its
+        depot
     """
     instances, tours = lesson
     rows = rng.permutation(len(instances))[: max(batch_size * _TYPICAL_SIZE // instances.n_tasks, 4)]
@@ -180,7 +182,21 @@ def _varied(lesson: Lesson, rng: np.random.Generator, batch_size: int) -> Lesson
     length = (tours > 0).sum(1, keepdim=True)
     steps = th.arange(tours.shape[1], device=tours.device)
     backwards = tours.gather(1, th.where(steps < length, length - 1 - steps, steps))
-    tours = th.where(th.from_numpy(rng.random((len(rows), 1)) < 0.5), backwards, tours)
+    is_backwards = th.from_numpy(rng.random((len(rows), 1)) < 0.5)
+    tours = th.where(is_backwards, backwards, tours)
+    if not instances.has_equal_uavs:
+        instances = _with_ends_exchanged(instances, is_backwards)
     n_steps = int(length.max()) + 1
     tours = functional.pad(tours, (0, max(n_steps - tours.shape[1], 0)))[:, :n_steps]
     return Lesson(turn(instances, th.from_numpy(rng.uniform(0, 2 * math.pi, len(rows)))), tours)
+
+
+def _with_ends_exchanged(instances: Instances, rows: th.Tensor) -> Instances:
+    """
+    :param instances: ``batch`` single-UAV instances
+    :param rows: ``(batch, 1)`` bool
+    :return: The instances, in these rows with the end as start and the start as end
+    """
+    start, end = instances.uav_start, instances.uav_end
+    exchanged = rows[..., None]
+    return replace(instances, start=th.where(exchanged, end, start), end=th.where(exchanged, start, end))

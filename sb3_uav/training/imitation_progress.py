@@ -15,8 +15,6 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import RouterPolicy
 
-_INSTANCE_FIELDS = ("depot", "tasks", "values", "max_distance", "task_mask")
-
 
 class Lesson(NamedTuple):
     """
@@ -51,7 +49,7 @@ class ImitationProgress:
         """
         # Copies, because torch saves the whole storage of a view.
         content = [
-            {"tours": lesson.tours.clone()} | {name: getattr(lesson.instances, name).clone() for name in _INSTANCE_FIELDS}
+            {name: field.clone() for name, field in _fields(lesson.instances).items()} | {"tours": lesson.tours.clone()}
             for lesson in lessons
         ]
         self._write(self._chunk_file(), rng, {"lessons": content})
@@ -143,6 +141,11 @@ class ImitationProgress:
         return ValueError(f"{path}: not an intact file ({what}); remove {self.folder} to start again.")
 
 
+def _fields(instances: Instances) -> dict[str, th.Tensor]:
+    """:return: The tensors of the instances by name, without those that are None"""
+    return {name: getattr(instances, name) for name in instances.present_fields()}
+
+
 def _lesson(fields: dict[str, Any]) -> Lesson:
     """
     :param fields: As :meth:`ImitationProgress.save_lessons` stores them
@@ -150,7 +153,9 @@ def _lesson(fields: dict[str, Any]) -> Lesson:
     :raises ValueError: If tours and instances do not fit together; others if the fields are of other kinds
     """
     tours = fields["tours"]
-    instances = Instances(n_uavs=1, **{name: fields[name] for name in _INSTANCE_FIELDS})
+    if not all(isinstance(field, th.Tensor) for field in fields.values()):
+        raise TypeError(f"fields are {[type(field).__name__ for field in fields.values()]}")
+    instances = Instances(n_uavs=1, **{name: field for name, field in fields.items() if name != "tours"})
     if tours.dtype != th.int64 or tours.ndim != 2 or len(tours) != len(instances) or len(tours) == 0:
         raise ValueError(f"tours are {tours.dtype} of shape {tuple(tours.shape)} for {len(instances)} instances")
     if int(tours.min()) < 0 or int(tours.max()) > instances.n_tasks:

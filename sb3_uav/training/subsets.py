@@ -12,6 +12,7 @@ from sb3_uav.common.random_streams import torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, training_batch
 from sb3_uav.envs.instances import Instances
+from sb3_uav.envs.world import WorldGenerator
 from sb3_uav.policies import AllocatorPolicy
 
 # Number of test instances allocated at once: the smaller of the paper's batch sizes.
@@ -105,7 +106,7 @@ class AllocatedSubsets(SingleUavGenerator):
         ones; fewer of them when they are large. Otherwise the next ``batch_size`` subsets. As every update draws a new
         batch, :attr:`fraction` does not apply to them.
         """
-        if not isinstance(self.generator, MixtureGenerator):
+        if not isinstance(self.generator, MixtureGenerator | WorldGenerator):
             return self(batch_size, rng)
         start = time.perf_counter()
         own_rng = self.stream(self._n_chunks)

@@ -1,0 +1,1 @@
+"""Random maps and task values, as plain arrays."""
