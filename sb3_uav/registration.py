@@ -13,6 +13,8 @@ GENERALIZATION_SIZES = (600, 700, 800, 900, 1000, 1500)
 DEMO_FLEET, DEMO_SIZE, DEMO_MAX_DISTANCE = 3, 20, 1.5
 # Training batches of mixed sizes, for one pair of networks that handles all of them.
 UNIVERSAL_ID, UNIVERSAL_FLEET, UNIVERSAL_SIZE = "TaskAllocation-Universal-v0", 8, 500
+# The same for the whole problem: any values, fleets and service costs.
+WORLD_ID, WORLD_FLEET, WORLD_SIZE = "TaskAllocation-World-v0", 10, 500
 # Of any size, by keyword arguments; the paper's smallest scenario without any.
 ALLOCATION_ID, ROUTING_ID = "TaskAllocation-v0", "RoutePlanning-v0"
 
@@ -32,8 +34,8 @@ def routing_id(n_tasks: int) -> str:
 
 def register_envs() -> None:
     """
-    Register the paper's scenarios (D = 2.0), the demo, the mixture, and both levels without a size. Registering them again has
-    no effect.
+    Register the paper's scenarios (D = 2.0), the demo, the mixtures, and both levels without a size. Registering them again
+    has no effect.
     """
     sizes = (*PAPER_SIZES, *GENERALIZATION_SIZES)
     for n_uavs in PAPER_FLEETS:
@@ -46,6 +48,7 @@ def register_envs() -> None:
     _register(routing_id(DEMO_SIZE), _ROUTING, DEMO_SIZE, **demo)
     universal = dict(n_uavs=UNIVERSAL_FLEET, distribution="mixture")
     _register(UNIVERSAL_ID, _ALLOCATION, UNIVERSAL_SIZE, **universal)
+    _register(WORLD_ID, _ALLOCATION, WORLD_SIZE, n_uavs=WORLD_FLEET, distribution="world")
     _register(ALLOCATION_ID, _ALLOCATION, PAPER_SIZES[0], n_uavs=PAPER_FLEETS[0])
     _register(ROUTING_ID, _ROUTING, PAPER_SIZES[0])
 
@@ -93,7 +96,7 @@ def ensure_registered(env_id: str, argument: str = "--env") -> None:
             f"{argument} is {env_id!r}, which no environment has; {guess}"
             "There are TaskAllocation-U{V}-N{N}-v0 for any V UAVs and N tasks (TaskAllocation-U4-N80-v0), "
             "RoutePlanning-N{N}-v0 for any N tasks (RoutePlanning-N80-v0), "
-            f"{ALLOCATION_ID} and {ROUTING_ID} with --env-kwargs (n_tasks:40 n_uavs:3), {UNIVERSAL_ID}, and what "
+            f"{ALLOCATION_ID} and {ROUTING_ID} with --env-kwargs (n_tasks:40 n_uavs:3), {UNIVERSAL_ID}, {WORLD_ID}, and what "
             "--gym-packages registers."
         )
     n_uavs, n_tasks = size

@@ -40,6 +40,8 @@ _PAPER_RANGE, _PAPER_FACTORS = 2.0, (0.6, 1.6)
 _PAPER_TASKS_PER_UAV = 12
 # Smallest number of tasks per UAV in training.
 _TASKS_PER_UAV = 4
+# How often a training batch has a single UAV, from which an allocator learns nothing and a router how to plan long tours.
+_SOLO = 0.12
 # How often tasks that no UAV can reach are left out of a training batch, as solvers do before networks see an instance.
 _COMPACT = 0.75
 # Bits of each coordinate on the space-filling curve.
@@ -103,7 +105,7 @@ class WorldGenerator:
     :param n_uavs: Largest fleet
     :param max_distance: Range of the UAV that flies farthest
     :param min_tasks: Smallest number of tasks of a training batch
-    :param min_uavs: Smallest fleet of a training batch; an allocator learns nothing from a fleet of one
+    :param min_uavs: Smallest fleet of a training batch; with 1, an eighth of the batches have a single UAV
     :param whole_share: Part of the rows, and of the training batches, in which fleets may differ from the paper's and serving
         a task may cost something; in the others UAVs are equal and only maps, values and ranges vary
     :param paper_share: Part of the rows that are drawn from the paper's distribution
@@ -155,7 +157,9 @@ class WorldGenerator:
         :param rng: Random generator
         :return: The instances
         """
-        n_uavs = _log_uniform_integer(rng, min(self.min_uavs, self.n_uavs), self.n_uavs)
+        n_uavs = _log_uniform_integer(rng, min(max(self.min_uavs, 2), self.n_uavs), self.n_uavs)
+        if self.min_uavs == 1 and rng.random() < _SOLO:
+            n_uavs = 1
         least = min(self.min_tasks, self.n_tasks)
         n_tasks = _log_uniform_integer(rng, min(max(least, _TASKS_PER_UAV * n_uavs), self.n_tasks), self.n_tasks)
         n_rows = n_instances_of(batch_size, least, n_tasks)

@@ -89,8 +89,8 @@ class FixedSetEvalCallback(BestPairOwner):
     :param best_by: Which returns decide on the best model: ``"greedy"`` or ``"sampled"``
     :param save_path: Folder of the files; the run folder when None
     :param verbose: Verbosity level: 0 for no output, 1 for a line per evaluation
-    :param sizes: UAVs, tasks and number of instances of each set to draw, such as ``[[4, 80, 48], [6, 200, 16]]``; in place of
-        ``instances`` and ``n_instances``
+    :param sizes: UAVs, tasks and number of instances of each set to draw, and maybe its distribution, such as
+        ``[[4, 80, 48], [6, 200, 16, clustered]]``; in place of ``instances`` and ``n_instances``
     :param max_distance: Maximum flight distance of the instances of these ``sizes``
     :param eval_updates: Updates between evaluations, in place of ``eval_freq``
     :raises FileNotFoundError: If there is no such file of instances
@@ -113,7 +113,7 @@ class FixedSetEvalCallback(BestPairOwner):
         best_by: str = "greedy",
         save_path: str | os.PathLike[str] | None = None,
         verbose: int = 0,
-        sizes: Sequence[Sequence[int]] | None = None,
+        sizes: Sequence[Sequence[Any]] | None = None,
         max_distance: float = 2.0,
         eval_updates: int | None = None,
     ) -> None:

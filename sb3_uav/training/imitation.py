@@ -162,7 +162,7 @@ def good_tours(subsets: Instances) -> th.Tensor:
     for row in range(len(subsets)):
         search = LocalSearch(subsets[row])
         n_trials = _TRIALS_PER_TASK * int(subsets.task_mask[row].sum())
-        routes.append([task + 1 for task in search.improve(Schedule([]), n_trials=n_trials).routes[0]])
+        routes.append([task + 1 for route in search.improve(Schedule([]), n_trials=n_trials).routes for task in route])
     n_steps = 1 + max(map(len, routes))
     padded = [route + [0] * (n_steps - len(route)) for route in routes]
     return th.tensor(padded, dtype=th.int64, device="cpu")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_uav.envs.generators import UniformGenerator
+from sb3_uav.envs.generators import make_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.training.fixed_set_returns import fingerprint
 
@@ -55,26 +55,29 @@ class InstanceSets:
 
     @classmethod
     def draw(
-        cls, sizes: Sequence[Sequence[int]], max_distance: float, source: Callable[[int, int], np.random.Generator]
+        cls, sizes: Sequence[Sequence[Any]], max_distance: float, source: Callable[[int, int], np.random.Generator]
     ) -> InstanceSets:
         """
-        :param sizes: UAVs, tasks and number of instances of each set
+        :param sizes: UAVs, tasks and number of instances of each set, and the name of their distribution, ``"uniform"`` if
+            there is none
         :param max_distance: Maximum flight distance
         :param source: Random generator by numbers of UAVs and tasks
-        :return: Uniform instances
+        :return: The sets
         :raises ValueError: If a size is not allowed or stands twice
         """
         found: dict[str, Instances] = {}
         for size in sizes:
-            if len(size) != 3 or not all(isinstance(number, int) and number >= 1 for number in size):
+            if len(size) not in (3, 4) or not all(isinstance(number, int) and number >= 1 for number in size[:3]):
                 raise ValueError(
-                    f"sizes: {size!r:.80} must be three whole numbers of at least 1: UAVs, tasks and number of instances."
+                    f"sizes: {size!r:.80} must be three whole numbers of at least 1, UAVs, tasks and number of instances, and "
+                    "may name a distribution."
                 )
-            n_uavs, n_tasks, n_instances = size
-            name = f"U{n_uavs}-N{n_tasks}"
+            n_uavs, n_tasks, n_instances = size[:3]
+            distribution = str(size[3]) if len(size) == 4 else "uniform"
+            name = f"U{n_uavs}-N{n_tasks}" + (f"-{distribution}" if len(size) == 4 else "")
             if name in found:
-                raise ValueError(f"sizes: {n_uavs} UAVs and {n_tasks} tasks stand twice; name every size once.")
-            generator = UniformGenerator(n_tasks, n_uavs, max_distance)
+                raise ValueError(f"sizes: {n_uavs} UAVs and {n_tasks} tasks stand twice; name every set once.")
+            generator = make_generator(n_tasks, n_uavs, max_distance, distribution)
             found[name] = generator(n_instances, source(n_uavs, n_tasks))
         if not found:
             raise ValueError("sizes is empty; give at least one triple of UAVs, tasks and number of instances.")

@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_uav.common.random_streams import torch_generator
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, training_batch
+from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, goes_beyond_the_paper, training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.world import WorldGenerator
 from sb3_uav.policies import AllocatorPolicy
@@ -31,6 +31,7 @@ class SingleUavGenerator:
     def __init__(self, generator: InstanceGenerator) -> None:
         self.generator = generator
         self.n_tasks = generator.n_tasks
+        self.beyond_the_paper = goes_beyond_the_paper(generator)
 
 
 class WholeInstances(SingleUavGenerator):
