@@ -25,6 +25,15 @@ STATIC_KEYS = ("depot", "tasks", "task_values", "task_mask", "max_distance")
 WHOLE_KEYS = ("uav_start", "uav_end", "uav_distance", "service")
 
 
+def static_keys_of(observation_space: spaces.Space) -> tuple[str, ...]:
+    """
+    :param observation_space: Observation space of one of our environments, or any other
+    :return: Keys of the observation that do not change during an episode
+    """
+    is_whole = isinstance(observation_space, spaces.Dict) and set(WHOLE_KEYS) <= set(observation_space.spaces)
+    return STATIC_KEYS + WHOLE_KEYS if is_whole else STATIC_KEYS
+
+
 class Stage(Enum):
     """How far an episode is, for drawings."""
 
@@ -150,11 +159,6 @@ class Problem(ABC):
     def is_whole(self) -> bool:
         """Whether observations show what goes beyond the paper's problem: starts, ends, distances and service costs."""
         return goes_beyond_the_paper(self.generator)
-
-    @property
-    def static_keys(self) -> tuple[str, ...]:
-        """Keys of the observation that do not change during an episode."""
-        return STATIC_KEYS + WHOLE_KEYS if self.is_whole else STATIC_KEYS
 
     @abstractmethod
     def dynamics(self, instances: Instances) -> Dynamics:

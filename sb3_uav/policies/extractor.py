@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
-from sb3_uav.envs.problem import STATIC_KEYS, WHOLE_KEYS
+from sb3_uav.envs.problem import STATIC_KEYS, static_keys_of
 from sb3_uav.policies.encoder import AttentionEncoder
 from sb3_uav.policies.grouping import EPISODE_INDEX, Grouping
 from sb3_uav.policies.settings import NetworkSettings
@@ -243,14 +243,12 @@ class EpisodicExtractor(EncodeOnceExtractor):
     def __init__(self, observation_space: spaces.Space, features_dim: int, settings: NetworkSettings) -> None:
         super().__init__(observation_space, features_dim, AttentionEncoder(settings))
         self.whole = settings.whole
-        assert isinstance(observation_space, spaces.Dict)
-        if set(WHOLE_KEYS) <= set(observation_space.spaces):
-            if not settings.whole:
-                raise ValueError(
-                    f"The instances of this environment have starts, ends, distances or service costs of their own, which "
-                    f"{type(self).__name__} would not see; use preset='whole'."
-                )
-            self.static_keys = STATIC_KEYS + WHOLE_KEYS
+        self.static_keys = static_keys_of(observation_space)
+        if self.static_keys != STATIC_KEYS and not settings.whole:
+            raise ValueError(
+                f"The instances of this environment have starts, ends, distances or service costs of their own, which "
+                f"{type(self).__name__} would not see; use preset='whole'."
+            )
 
     @classmethod
     def n_actions(cls, observation_space: spaces.Space) -> int:

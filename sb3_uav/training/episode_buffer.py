@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_uav.envs.problem import STATIC_KEYS
+from sb3_uav.envs.problem import static_keys_of
 from sb3_uav.policies.grouping import EPISODE_INDEX
 from sb3_uav.policies.masked_policy import MaskedPolicy
 
@@ -43,7 +43,8 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: Factor for trade-off of bias vs variance for Generalized Advantage Estimator
     :param gamma: Discount factor
     :param n_envs: Number of parallel environments
-    :param static_keys: Keys of the observation that an episode keeps; those that the policy encodes
+    :param static_keys: Keys of the observation that an episode keeps; those that the policy encodes. When None, those of the
+        environments of sb3_uav
     :raises ValueError: If the observation space has not these keys and others
     """
 
@@ -61,8 +62,10 @@ class EpisodeRolloutBuffer(DictRolloutBuffer):
         gae_lambda: float = 1,
         gamma: float = 0.99,
         n_envs: int = 1,
-        static_keys: tuple[str, ...] = STATIC_KEYS,
+        static_keys: tuple[str, ...] | None = None,
     ):
+        if static_keys is None:
+            static_keys = static_keys_of(observation_space)
         if not isinstance(observation_space, spaces.Dict) or not set(static_keys) < set(observation_space.spaces):
             raise ValueError(
                 f"{type(self).__name__} needs the Dict observation of a sb3_uav environment, or rollout_buffer_kwargs="
