@@ -185,12 +185,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     print_report(report(rows), f"{name}: {len(benchmark.instances)} instances, gap to the best-known values")
     for line in (*notes(benchmark, best_known), *repairs(rows)):
         print(line)
-    files = [args.out / "summary.md", *_draw_curve(rows, args.out)]
+    files = [args.out / "summary.md", *_draw_curve(rows, args.out, name)]
     print(*(str(path) for path in files))
     return _exit_code(rows)
 
 
-def _draw_curve(rows: Sequence[GapRow], folder: Path) -> list[Path]:
+def _draw_curve(rows: Sequence[GapRow], folder: Path, title: str) -> list[Path]:
     """:return: The curve of gap against time, if there are several time limits and something to draw"""
     if len({row.time_limit for row in rows if row.time_limit is not None}) < 2:
         return []
@@ -198,7 +198,7 @@ def _draw_curve(rows: Sequence[GapRow], folder: Path) -> list[Path]:
     from sb3_uav.plots.gap_curve import plot_gaps
 
     try:
-        return [plot_gaps(rows, folder / CURVE_FILE)]
+        return [plot_gaps(rows, folder / CURVE_FILE, title)]
     except ValueError as error:
         print(f"sb3-uav: {error}", file=sys.stderr)
         return []

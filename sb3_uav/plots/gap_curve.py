@@ -16,7 +16,7 @@ from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 _FOOTNOTE = "Bands and bars: 95 % confidence of the mean over the instances"
 
 
-def plot_gaps(rows: Sequence[GapRow], path: Path) -> Path:
+def plot_gaps(rows: Sequence[GapRow], path: Path, title: str = "Benchmark") -> Path:
     """
     Draw the mean gap of every solver against its mean wall time, over the instances that have a best-known value.
 
@@ -24,13 +24,14 @@ def plot_gaps(rows: Sequence[GapRow], path: Path) -> Path:
 
     :param rows: Gaps of all solvers and time limits
     :param path: The ``.png``, ``.pdf`` or ``.svg`` to write
+    :param title: Name of the benchmark
     :return: The path
     :raises ValueError: If there is nothing to draw, or the suffix is not allowed
     :raises ImportError: If matplotlib is not installed
     """
     path = checked_path(path)
     known = [row for row in rows if row.best_known is not None]
-    panel = _gap_panel(known)
+    panel = _gap_panel(known, title)
     if not panel.curves:
         raise ValueError(f"{path}: no solver has solved all instances; there is nothing to draw.")
     numbers = {solver: number for number, solver in enumerate(dict.fromkeys(row.solver for row in known))}
@@ -41,9 +42,10 @@ def plot_gaps(rows: Sequence[GapRow], path: Path) -> Path:
     return path
 
 
-def _gap_panel(rows: Sequence[GapRow]) -> Panel:
+def _gap_panel(rows: Sequence[GapRow], title: str) -> Panel:
     """
     :param rows: Gaps on instances with a best-known value
+    :param title: Name of the benchmark
     :return: What to draw
     """
     instances = list(dict.fromkeys(row.instance for row in rows))
@@ -65,5 +67,6 @@ def _gap_panel(rows: Sequence[GapRow]) -> Panel:
             left_out.append(f"{solver} ({', '.join(missing)})" if missing else solver)
         if points:
             seconds, means, halfwidths = np.array(sorted(points)).T
-            curves.append(Curve(solver, seconds, means, halfwidths, batch_size=1))
-    return Panel("Benchmark", len(instances), curves, left_out)
+            batch_size = max(row.batch_size or 1 for found in by_limit.values() for row in found)
+            curves.append(Curve(solver, seconds, means, halfwidths, batch_size))
+    return Panel(title, len(instances), curves, left_out)

@@ -49,7 +49,8 @@ class GapRow:
     :param length: Total length of these routes, under the rule of the file
     :param euclidean_objective: What the solver found with Euclidean lengths
     :param n_dropped: How many tasks the rule of the file made drop
-    :param seconds: Wall time of the solver
+    :param seconds: Wall time of the solver: that of its batch, divided by the size of the batch
+    :param batch_size: How many instances were solved at once
     :param message: Why there is no objective
     """
 
@@ -68,6 +69,7 @@ class GapRow:
     euclidean_objective: float | None
     n_dropped: int
     seconds: float | None
+    batch_size: int | None
     message: str
 
 
@@ -149,6 +151,7 @@ def _compared(
         euclidean_objective=result.objective,
         n_dropped=0 if schedule is None or counted is None else schedule.n_visited - counted.n_visited,
         seconds=result.seconds,
+        batch_size=result.batch_size,
         message=message,
     )
     return row, counted
@@ -202,12 +205,13 @@ def failures(rows: Sequence[GapRow]) -> list[str]:
     :param rows: What :func:`find_gaps` returned
     :return: Every reason of a failure once, with the number of instances, or the name of the only one
     """
-    found: dict[tuple[str, str, str], list[str]] = {}
+    # Of the names, which keep their order; several time limits or seeds count once.
+    found: dict[tuple[str, str, str], dict[str, None]] = {}
     for row in rows:
         if row.status in (FAILED, INFEASIBLE):
-            found.setdefault((row.solver, row.status, row.message), []).append(row.instance)
+            found.setdefault((row.solver, row.status, row.message), {})[row.instance] = None
     return [
         f"{solver} {'failed' if status == FAILED else 'was infeasible'} on "
         f"{names[0] if len(names) == 1 else f'{len(names)} instances ({names[0]} to {names[-1]})'}: {message}"
-        for (solver, status, message), names in found.items()
+        for (solver, status, message), names in ((key, list(value)) for key, value in found.items())
     ]

@@ -35,7 +35,10 @@ def finite_number(text: str) -> float:
     :return: The number
     :raises ValueError: If it is no finite number, as files write them (no ``1_000``, which Python would read)
     """
-    number = float(text) if "_" not in text else math.nan
+    try:
+        number = float(text) if "_" not in text else math.nan
+    except ValueError:
+        number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"{text!r} is no finite number")
     return number

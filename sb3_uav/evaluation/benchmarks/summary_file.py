@@ -52,7 +52,9 @@ def repairs(rows: Sequence[GapRow]) -> list[str]:
         dropped = [row for row in rows if row.solver == solver and row.n_dropped > 0]
         if dropped:
             n_tasks = sum(row.n_dropped for row in dropped)
-            lines.append(f"{solver}: the rule took {n_tasks} task{'s' * (n_tasks > 1)} from {len(dropped)} of its tours.")
+            lines.append(
+                f"{solver}: the rounding rule took {n_tasks} task{'s' * (n_tasks > 1)} from {len(dropped)} of its tours."
+            )
     return lines
 
 
