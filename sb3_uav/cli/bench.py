@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_uav.cli.solver_specs import solvers_of
-from sb3_uav.common.optional import install_command
+from sb3_uav.common.optional import install_command, require
 
 if TYPE_CHECKING:
     from sb3_uav.evaluation.benchmarks.gaps import GapRow
@@ -150,15 +150,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     from sb3_uav.evaluation.benchmarks.report import print_report, report
     from sb3_uav.evaluation.benchmarks.run import run_benchmark
     from sb3_uav.evaluation.benchmarks.summary_file import notes, repairs
-    from sb3_uav.evaluation.table import require_rich
     from sb3_uav.solvers.unavailable import UnavailableSolver
 
     # What may be missing or wrong is found before the long run, not after it.
-    require_rich()
+    require("rich.table", "Printing tables", "bench")
     time_limits = args.time_limits or (None,)
     if len(time_limits) > 1:
-        from sb3_uav.common.optional import require
-
         require("matplotlib.figure", "Drawing", "bench")
     best_known = read_best_known(args.best_known)
     benchmark = read_folder(args.folder, args.only, list(best_known))
