@@ -84,6 +84,7 @@ def changed(text: str, line: int, to: str | None) -> str:
         (2, "m 0", "'m' is 0, but must be a whole number of at least 1"),
         (2, "m 1_0", "line 2: expected 'm NUMBER', found 'm 1_0'"),
         (2, None, "line 2: expected 'm NUMBER', found 'tmax 30.0'"),
+        (2, "m 1e12", "'m' is 1e+12, but must be at most 10000"),
         (3, "tmax 0", "'tmax' is 0, but must be more than 0"),
         (3, "tmax nan", "line 3: expected 'tmax NUMBER', found 'tmax nan'"),
         (3, None, "line 3: expected 'tmax NUMBER', found"),
@@ -305,7 +306,7 @@ def test_wrong_folders(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no benchmark file"):
         read_folder(tmp_path)
     (tmp_path / "a.txt").write_bytes(b"n 3\n\xff\xfe")
-    with pytest.raises(ValueError, match=r"a\.txt: is no text file"):
+    with pytest.raises(ValueError, match=r"a\.txt, line 2: expected 'm NUMBER', found"):
         read_folder(tmp_path)
     with pytest.raises(ValueError, match=r"no instance has a name like q\*"):
         read_folder(FILES, ["q*"])

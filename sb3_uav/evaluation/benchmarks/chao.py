@@ -7,6 +7,8 @@ from pathlib import Path
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.benchmarks.instance import BenchmarkInstance, finite_number
 
+# Each has an end of its own in memory.
+_MOST_VEHICLES = 10_000
 _HEADER = ("n", "m", "tmax")
 _REMEDY = "get the file again, or take it out of the folder"
 
@@ -29,6 +31,8 @@ def read_chao(path: Path, text: str, group: str) -> BenchmarkInstance:
     for key, number, least in (("n", n_points, 3), ("m", n_vehicles, 1)):
         if number != int(number) or number < least:
             raise ValueError(f"{path}: '{key}' is {number:g}, but must be a whole number of at least {least}; {_REMEDY}.")
+    if n_vehicles > _MOST_VEHICLES:
+        raise ValueError(f"{path}: 'm' is {n_vehicles:g}, but must be at most {_MOST_VEHICLES}; {_REMEDY}.")
     if limit <= 0:
         raise ValueError(f"{path}: 'tmax' is {limit:g}, but must be more than 0; {_REMEDY}.")
     if len(lines) - len(_HEADER) != n_points:

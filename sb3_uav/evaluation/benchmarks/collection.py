@@ -132,10 +132,8 @@ def _read_file(path: Path, group: str, is_known: bool) -> list[BenchmarkInstance
         ]
     if path.suffix.lower() not in _TEXT_SUFFIXES and not is_known:
         return None
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is no text file ({error}); get the file again, or take it out of the folder.") from error
+    # Comments may be in any encoding; where numbers are damaged, the readers say so.
+    text = path.read_text(encoding="utf-8", errors="replace")
     first = text.split(maxsplit=1)[:1]
     if "_SECTION" in text:
         return [read_oplib(path, text, group)]

@@ -12,6 +12,9 @@ from sb3_uav.evaluation.results import FAILED, INFEASIBLE
 from sb3_uav.evaluation.table import require_rich
 
 ALL = "all"
+# After the mean gap of some of the results only.
+PARTIAL = "*"
+ABOUT_PARTIAL = f"{PARTIAL} mean over those that are solved and have a best-known value, not over all"
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,8 @@ class ReportRow:
     :param solver: Name of the solver
     :param time_limit: Seconds that it was given
     :param n_results: Number of results; instances times seeds
-    :param n_compared: How many of them have an objective and a best-known value
+    :param n_known: How many of them have a best-known value
+    :param n_compared: How many of these have an objective
     :param gap: Mean gap of these in percent; NaN if there are none
     :param n_reached: How many reach the best-known value
     :param n_better: How many exceed it
@@ -36,6 +40,7 @@ class ReportRow:
     solver: str
     time_limit: float | None
     n_results: int
+    n_known: int
     n_compared: int
     gap: float
     n_reached: int
@@ -70,6 +75,7 @@ def _report_row(group: str, run: Sequence[GapRow]) -> ReportRow:
         solver=run[0].solver,
         time_limit=run[0].time_limit,
         n_results=len(run),
+        n_known=sum(row.best_known is not None for row in run),
         n_compared=len(gaps),
         gap=_mean(gaps),
         n_reached=sum(row.reached for row in run),
@@ -94,23 +100,23 @@ def table_cells(summary: Sequence[ReportRow]) -> tuple[list[str], list[list[str]
         columns.append(("Group", [row.group for row in summary]))
     columns.append(("Solver", [row.solver for row in summary]))
     if any(row.time_limit is not None for row in summary):
-        columns.append(("Limit s", ["-" if row.time_limit is None else f"{row.time_limit:g}" for row in summary]))
-    columns.append(("Gap %", [_gap(row) for row in summary]))
-    columns.append(("Reached", [f"{row.n_reached}/{row.n_results}" for row in summary]))
+        columns.append(("Limit\ns", ["-" if row.time_limit is None else f"{row.time_limit:g}" for row in summary]))
+    columns.append(("Gap\n%", [_gap(row) for row in summary]))
+    columns.append(("Reached", [f"{row.n_reached}/{row.n_known}" for row in summary]))
     columns.append(("Better", [f"{row.n_better}" for row in summary]))
     if any(row.n_infeasible for row in summary):
-        columns.append(("Infeasible", [f"{row.n_infeasible}" for row in summary]))
+        columns.append(("Infeas-\nible", [f"{row.n_infeasible}" for row in summary]))
     if any(row.n_failed for row in summary):
         columns.append(("Failed", [f"{row.n_failed}" for row in summary]))
-    columns.append(("s each", ["-" if math.isnan(row.seconds) else f"{row.seconds:.3f}" for row in summary]))
+    columns.append(("s\neach", ["-" if math.isnan(row.seconds) else f"{row.seconds:.3f}" for row in summary]))
     return [heading for heading, _ in columns], [list(cells) for cells in zip(*(c for _, c in columns), strict=True)]
 
 
 def _gap(row: ReportRow) -> str:
-    """The mean gap, and of how many results if not all."""
+    """The mean gap, marked if it is not that of all results."""
     if math.isnan(row.gap):
         return "-"
-    return f"{row.gap:.2f}" + ("" if row.n_compared == row.n_results else f" (n={row.n_compared})")
+    return f"{row.gap:.2f}" + (PARTIAL if row.n_compared < row.n_results else "")
 
 
 def print_report(summary: Sequence[ReportRow], title: str) -> None:
@@ -124,12 +130,13 @@ def print_report(summary: Sequence[ReportRow], title: str) -> None:
     rich = require_rich()
     console = rich.console.Console()
     headings, rows = table_cells(summary)
+    # Narrow, so that most tables fit into 80 columns.
     # Text, because rich would take brackets in a name for markup.
-    table: Any = rich.table.Table(title=rich.text.Text(title), box=rich.box.SIMPLE_HEAD)
+    table: Any = rich.table.Table(title=rich.text.Text(title), box=rich.box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     n_names = headings.index("Solver") + 1
     for position, heading in enumerate(headings):
         if position < n_names:
-            table.add_column(heading, overflow="fold")
+            table.add_column(heading, overflow="fold", min_width=min(10, *(len(cells[position]) for cells in rows)))
         else:
             table.add_column(heading, justify="right", no_wrap=True)
     for position, (row, cells) in enumerate(zip(summary, rows, strict=True)):
@@ -139,6 +146,8 @@ def print_report(summary: Sequence[ReportRow], title: str) -> None:
             # Once is enough.
             cells = ["", *cells[1:]]
         table.add_row(*(rich.text.Text(cell) for cell in cells))
+    if any(PARTIAL in cells[headings.index("Gap\n%")] for cells in rows):
+        table.caption = rich.text.Text(ABOUT_PARTIAL)
     if not console.is_terminal:
         # Without a terminal, rich assumes 80 columns and breaks the names of solvers.
         console.width = max(console.measure(table, options=console.options.update(width=10_000)).maximum, 80)
@@ -151,6 +160,7 @@ def markdown_table(summary: Sequence[ReportRow]) -> list[str]:
     :return: Lines of the same table
     """
     headings, rows = table_cells(summary)
+    headings = [heading.replace("-\n", "").replace("\n", " ") for heading in headings]
     n_names = headings.index("Solver") + 1
     rule = ["---" if position < n_names else "---:" for position in range(len(headings))]
     cells = [headings, rule, *([cell.replace("|", "\\|") for cell in row] for row in rows)]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from sb3_uav.evaluation.benchmarks.collection import BenchmarkFolder
 from sb3_uav.evaluation.benchmarks.gaps import GAPS_FILE, ROUTES_FILE, GapRow, failures
-from sb3_uav.evaluation.benchmarks.report import markdown_table, report
+from sb3_uav.evaluation.benchmarks.report import ABOUT_PARTIAL, markdown_table, report
 from sb3_uav.evaluation.benchmarks.rounding import RULE
 from sb3_uav.evaluation.results import RESULTS_FILE
 
@@ -65,6 +65,7 @@ def summary_text(benchmark: BenchmarkFolder, best_known: Mapping[str, float], ro
     :param rows: Gaps
     :return: The text of ``summary.md``
     """
+    table = report(rows)
     n_known = len(set(benchmark.instances) & set(best_known))
     seeds = ", ".join(str(seed) for seed in sorted({row.seed for row in rows}))
     lines = [
@@ -72,11 +73,14 @@ def summary_text(benchmark: BenchmarkFolder, best_known: Mapping[str, float], ro
         "",
         f"{len(benchmark.instances)} instances, {n_known} of them with a best-known value; seed {seeds}.",
         "",
-        *markdown_table(report(rows)),
+        *markdown_table(table),
         "",
         "Gap: (best known - objective) / best known, mean over the results that have both; negative where the objective is",
         "more, 0 where the best-known value is 0. Reached: objective at least the best-known value. Better: more than that.",
     ]
+    if any(0 < row.n_compared < row.n_results for row in table):
+        # The star is none of Markdown's.
+        lines += ["", "\\" + ABOUT_PARTIAL + "."]
     for line in (*notes(benchmark, best_known), *repairs(rows)):
         lines += ["", line]
     better = [row for row in rows if row.better]
