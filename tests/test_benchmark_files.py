@@ -135,6 +135,14 @@ def test_oplib_file() -> None:
 
 
 @needs_vrplib
+def test_the_score_of_the_depot_is_kept_apart() -> None:
+    """Best-known values of OPLib include it."""
+    assert read_oplib(ANYWHERE, OPLIB, "").depot_score == 0
+    found = read_oplib(ANYWHERE, OPLIB.replace("\n1 0\n", "\n1 5\n"), "")
+    assert found.depot_score == 5 and found.instances.values.sum() == 38
+
+
+@needs_vrplib
 @given(st.integers(1, 6), st.integers(0, 2**31), st.data())
 def test_oplib_files_are_read_as_they_are_written(n_tasks: int, seed: int, data: st.DataObject) -> None:
     depot = data.draw(st.integers(1, n_tasks + 1))
@@ -188,7 +196,6 @@ def test_matrices_are_refused_by_name() -> None:
         ("8 6\n", "", "DIMENSION is 8, but NODE_SCORE_SECTION has 7 lines"),
         ("7 6\n8 6\n", "8 6\n7 6\n", "line 23: NODE_SCORE_SECTION: expected 7, then the score, found '8 6'"),
         ("2 7\n", "2 -7\n", "line 18: NODE_SCORE_SECTION: the score is -7, but must be at least 0"),
-        ("1 0\n2 7", "1 5\n2 7", "NODE_SCORE_SECTION gives the depot 5, but must give it 0"),
         ("NODE_SCORE_SECTION\n", "", "NODE_COORD_SECTION: expected 9, then x and y, found '1 0'"),
         ("DEPOT_SECTION\n1\n", "DEPOT_SECTION\n", "DEPOT_SECTION names no node, but must name one of nodes 1 to 8"),
         ("DEPOT_SECTION\n1\n", "DEPOT_SECTION\n9\n", "DEPOT_SECTION names 9, but must name one of nodes 1 to 8"),

@@ -20,7 +20,8 @@ from sb3_uav.evaluation import evaluate
 from sb3_uav.evaluation.benchmarks.gaps import GapRow, failures, find_gaps, gap_to
 from sb3_uav.evaluation.benchmarks.instance import BenchmarkInstance
 from sb3_uav.evaluation.benchmarks.report import markdown_table, report
-from sb3_uav.evaluation.benchmarks.rounding import check_rounded, fit_to_rule, rounded_distance
+from sb3_uav.evaluation.benchmarks.rounding import check_rounded, fill, fit_to_rule, rounded_distance
+from sb3_uav.evaluation.benchmarks.summary_file import repairs
 
 
 def test_halves_are_rounded_up() -> None:
@@ -92,6 +93,36 @@ def test_another_order_can_be_enough() -> None:
     assert found > 5
 
 
+@given(st.integers(1, 12), st.integers(0, 2**31), st.floats(1, 60))
+def test_filled_tours_are_feasible_by_the_rule(n_tasks: int, seed: int, limit: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 12, (n_tasks + 1, 2))
+    instance = Instances.from_arrays(points[0], points[1:], rng.integers(0, 9, n_tasks), limit, 1)
+    before = Schedule([[]])
+    filled = fill(instance, before)
+    objective = check_rounded(instance, filled).objective
+    # No valuable task is left that alone would have fitted.
+    values = instance.values[0].tolist()
+    alone = [values[task] for task in range(n_tasks) if rounded_length(instance, (task,)) <= limit]
+    assert objective >= max(alone, default=0.0) > 0 or objective == 0 == max(alone, default=0.0)
+    again = fill(instance, filled)
+    assert check_rounded(instance, again).objective == objective
+
+
+def test_rounding_can_leave_room() -> None:
+    # Edges of 1.4 count 1.
+    instance = on_a_line([1.4, 2.8], [5.0, 3.0], 4.0)
+    with pytest.raises(InfeasibleScheduleError):
+        check_schedule(instance, 0, Schedule([[0, 1]]))
+    filled = fill(instance, Schedule([[0]]))
+    # There 1, on 1, back 3: too long.
+    assert filled.routes == ((0,),)
+    shorter = on_a_line([1.4, -1.4], [5.0, 3.0], 5.0)
+    assert sorted(fill(shorter, Schedule([[0]])).routes[0]) == [0, 1]
+    with pytest.raises(InfeasibleScheduleError, match=r"flies 5\.6"):
+        check_schedule(shorter, 0, fill(shorter, Schedule([[0]])))
+
+
 @pytest.mark.parametrize("routes", [[[0], [1]], [[0, 0]], [[2]], [[-1]]])
 def test_the_rule_refuses_what_is_no_schedule(routes: list[list[int]]) -> None:
     with pytest.raises(InfeasibleScheduleError):
@@ -158,12 +189,24 @@ def test_results_become_gaps(tmp_path: Path) -> None:
     assert "| all | told | 13.33* | 2/4 | 1 | 1 | 0.500 |" in markdown_table(report(rows))
 
 
+def test_depot_and_room_count(tmp_path: Path) -> None:
+    line = on_a_line([1.4, -1.4], [5.0, 3.0], 5.0)
+    member = replace(benchmark(line, "a.1", True), depot_score=2.0)
+    evaluate([Told([[0]])], {"a": line}, tmp_path)
+    ((row,), (route,)) = find_gaps(tmp_path, [member], {"a.1": 10.0})
+    assert (row.objective, row.euclidean_objective, row.gap, row.n_added, row.length) == (7, 7, 30, 0, 2)
+    ((row,), (route,)) = find_gaps(tmp_path, [member], {"a.1": 10.0}, use_rounding=True)
+    assert (row.objective, row.euclidean_objective, row.gap, row.n_added, row.length) == (10, 7, 0, 1, 5)
+    assert row.reached and not row.better and sorted(route["routes"][0]) == [2, 3]
+    assert repairs([row]) == ["told: by the rounding rule 1 task could be put into 1 of its tours."]
+
+
 def test_several_limits_count_once_among_failures() -> None:
-    row = GapRow("x.1", "x", "s", 1.0, 0, "failed", 5.0, None, None, False, False, None, None, 0, None, None, "no way")
+    row = GapRow("x.1", "x", "s", 1.0, 0, "failed", 5.0, None, None, False, False, None, None, 0, 0, None, None, "no way")
     rows = [row, replace(row, time_limit=2.0), replace(row, instance="x.2")]
     assert failures(rows) == ["s failed on 2 instances (x.1 to x.2): no way"]
 
 
 def test_a_pipe_in_a_name_stays_in_its_cell() -> None:
-    row = GapRow("x.1", "x", "a|b", None, 0, "ok", 5.0, 5.0, 0.0, True, False, 1.0, 5.0, 0, 1.0, 1, "")
+    row = GapRow("x.1", "x", "a|b", None, 0, "ok", 5.0, 5.0, 0.0, True, False, 1.0, 5.0, 0, 0, 1.0, 1, "")
     assert markdown_table(report([row]))[-1].startswith("| a\\|b |")

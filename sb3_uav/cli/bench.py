@@ -26,7 +26,8 @@ files in FOLDER and in the folders in it:
   have its name, a dot and their row, from 0. They are grouped by folder, or else by their name up to the first dot.
 
 OPLib's rule rounds the length of every edge. Solvers see Euclidean lengths; a tour that is too long by the rule is shortened,
-by other orders first and then by leaving out tasks, before its objective is compared.
+by other orders first and then by leaving out tasks, before its objective is compared. With --use-rounding, further tasks are
+put into tours, the most valuable per length first, as long as the rule admits it.
 
 files in DIR:
   summary.md                      the table, what was left out, objectives above the best-known value, failures
@@ -81,6 +82,9 @@ def _make_parser() -> argparse.ArgumentParser:
         default=1,
         metavar="N",
         help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--use-rounding", action="store_true", help="OPLib: put more tasks into tours where rounding leaves room (see below)"
     )
     parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
     networks = parser.add_argument_group("networks")
@@ -174,6 +178,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 time_limits=time_limits,
                 n_jobs=args.jobs,
                 resume=not args.overwrite,
+                use_rounding=args.use_rounding,
             )
     except KeyboardInterrupt:
         print(f"sb3-uav: {args.out} holds the results so far; run the same command again to resume.", file=sys.stderr)

@@ -12,7 +12,7 @@ from typing import Any
 from sb3_uav.common.files import replaced_when_complete, write_csv
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, check_schedule
 from sb3_uav.evaluation.benchmarks.instance import BenchmarkInstance
-from sb3_uav.evaluation.benchmarks.rounding import check_rounded, fit_to_rule
+from sb3_uav.evaluation.benchmarks.rounding import check_rounded, fill, fit_to_rule
 from sb3_uav.evaluation.results import (
     FAILED,
     INFEASIBLE,
@@ -42,13 +42,15 @@ class GapRow:
     :param seed: Seed of the solver
     :param status: ``ok``, ``infeasible`` or ``failed``
     :param best_known: The best-known value
-    :param objective: Total value of the routes that count, under the rule of the file
+    :param objective: Total value of the routes that count, under the rule of the file; with the score of the depot, if the
+        file gives it one
     :param gap: How far the objective is below the best-known value, in percent of that; negative above it. 0 if both are 0
     :param reached: Whether the objective is at least the best-known value
     :param better: Whether it is more
     :param length: Total length of these routes, under the rule of the file
-    :param euclidean_objective: What the solver found with Euclidean lengths
+    :param euclidean_objective: What the solver found with Euclidean lengths, with the score of the depot
     :param n_dropped: How many tasks the rule of the file made drop
+    :param n_added: How many tasks were put in because that rule admits more, on demand
     :param seconds: Wall time of the solver: that of its batch, divided by the size of the batch
     :param batch_size: How many instances were solved at once
     :param message: Why there is no objective
@@ -68,6 +70,7 @@ class GapRow:
     length: float | None
     euclidean_objective: float | None
     n_dropped: int
+    n_added: int
     seconds: float | None
     batch_size: int | None
     message: str
@@ -86,7 +89,7 @@ def gap_to(best_known: float, objective: float) -> float:
 
 
 def find_gaps(
-    folder: Path, instances: Sequence[BenchmarkInstance], best_known: Mapping[str, float]
+    folder: Path, instances: Sequence[BenchmarkInstance], best_known: Mapping[str, float], use_rounding: bool = False
 ) -> tuple[list[GapRow], list[dict[str, Any]]]:
     """
     Compare all results in the folder of an evaluation.
@@ -94,6 +97,7 @@ def find_gaps(
     :param folder: The folder
     :param instances: The instances in the order in which they were evaluated
     :param best_known: Best-known values by name
+    :param use_rounding: Whether to put further tasks into tours where a rounding rule leaves room for them
     :return: A row for every result; and for every objective the routes that count, by the numbers of their nodes in the file
     :raises ValueError: If a file of the folder is damaged
     """
@@ -107,7 +111,7 @@ def find_gaps(
         schedule = None
         if result.status == OK:
             schedule = Schedule(json.loads(schedules[result.key])["routes"])
-        row, counted = _compared(instance, result, schedule, best_known.get(instance.name))
+        row, counted = _compared(instance, result, schedule, best_known.get(instance.name), use_rounding)
         rows.append(row)
         if counted is not None:
             routes.append(_route_line(instance, row, counted))
@@ -115,23 +119,32 @@ def find_gaps(
 
 
 def _compared(
-    instance: BenchmarkInstance, result: ResultRow, schedule: Schedule | None, best_known: float | None
+    instance: BenchmarkInstance,
+    result: ResultRow,
+    schedule: Schedule | None,
+    best_known: float | None,
+    use_rounding: bool,
 ) -> tuple[GapRow, Schedule | None]:
     """
     :param instance: An instance
     :param result: A result
     :param schedule: Its schedule, if it is feasible with Euclidean lengths
     :param best_known: The best-known value, if there is one
+    :param use_rounding: As of :func:`find_gaps`
     :return: The comparison, and the schedule that counts
     """
     status, message = result.status, result.message
     objective = length = None
     counted = schedule
+    n_dropped = n_added = 0
     if schedule is not None:
         try:
-            counted, objective, length = _counted(instance, schedule)
+            counted, objective, length = _counted(instance, schedule, use_rounding)
         except InfeasibleScheduleError as error:
             status, message, counted = INFEASIBLE, one_line(error), None
+        else:
+            found, kept = ({task for route in of.routes for task in route} for of in (schedule, counted))
+            n_dropped, n_added = len(found - kept), len(kept - found)
     tolerance = _TOLERANCE * max(1.0, best_known or 0.0)
     known = objective is not None and best_known is not None
     difference = (objective or 0.0) - (best_known or 0.0)
@@ -148,8 +161,9 @@ def _compared(
         reached=known and difference >= -tolerance,
         better=known and difference > tolerance,
         length=length,
-        euclidean_objective=result.objective,
-        n_dropped=0 if schedule is None or counted is None else schedule.n_visited - counted.n_visited,
+        euclidean_objective=None if result.objective is None else result.objective + instance.depot_score,
+        n_dropped=n_dropped,
+        n_added=n_added,
         seconds=result.seconds,
         batch_size=result.batch_size,
         message=message,
@@ -157,20 +171,24 @@ def _compared(
     return row, counted
 
 
-def _counted(instance: BenchmarkInstance, schedule: Schedule) -> tuple[Schedule, float, float]:
+def _counted(instance: BenchmarkInstance, schedule: Schedule, use_rounding: bool) -> tuple[Schedule, float, float]:
     """
     :param instance: An instance
     :param schedule: A schedule of it
-    :return: The schedule under the rule of the file, its objective and its length by that rule, as the checkers say
+    :param use_rounding: As of :func:`find_gaps`
+    :return: The schedule under the rule of the file; its objective and its length by that rule, as the checkers say, with the
+        score of the depot
     :raises InfeasibleScheduleError: If a checker refuses it
     """
     if instance.is_rounded:
         schedule = fit_to_rule(instance.instances, schedule)
     report = check_schedule(instance.instances, 0, schedule)
     if not instance.is_rounded:
-        return schedule, report.objective, report.length
+        return schedule, report.objective + instance.depot_score, report.length
+    if use_rounding:
+        schedule = fill(instance.instances, schedule)
     rounded = check_rounded(instance.instances, schedule)
-    return schedule, rounded.objective, math.fsum(rounded.lengths)
+    return schedule, rounded.objective + instance.depot_score, math.fsum(rounded.lengths)
 
 
 def _route_line(instance: BenchmarkInstance, row: GapRow, schedule: Schedule) -> dict[str, Any]:

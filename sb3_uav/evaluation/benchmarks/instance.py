@@ -19,6 +19,8 @@ class BenchmarkInstance:
     :param nodes: Number of every task in the file: of its points, from 1; in an ``.npz`` of its tasks, from 0
     :param is_rounded: Whether the file's own rule rounds the length of every edge to the nearest whole number, see
         :mod:`~sb3_uav.evaluation.benchmarks.rounding`; without it lengths are Euclidean
+    :param depot_score: Score of the depot in the file, which every tour collects. It is no part of ``instances``, but of
+        best-known values
     """
 
     name: str
@@ -27,6 +29,7 @@ class BenchmarkInstance:
     instances: Instances
     nodes: tuple[int, ...]
     is_rounded: bool = False
+    depot_score: float = 0.0
 
 
 def finite_number(text: str) -> float:

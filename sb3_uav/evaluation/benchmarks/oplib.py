@@ -35,7 +35,8 @@ class UnsupportedMetricError(ValueError):
 
 def read_oplib(path: Path, text: str, group: str) -> BenchmarkInstance:
     """
-    Read an OPLib file: one vehicle, which returns to the node of ``DEPOT_SECTION`` within ``COST_LIMIT``.
+    Read an OPLib file: one vehicle, which returns to the node of ``DEPOT_SECTION`` within ``COST_LIMIT``. In most files the
+    depot has a score too, which best-known values include.
 
     Its rule rounds the length of each edge; the instance itself has Euclidean lengths, see
     :mod:`~sb3_uav.evaluation.benchmarks.rounding`.
@@ -69,8 +70,6 @@ def read_oplib(path: Path, text: str, group: str) -> BenchmarkInstance:
     depot = _depot(path, fields.get("depot"), int(n_nodes))
     points = np.asarray(fields["node_coord"], dtype=np.float64)
     scores = np.asarray(fields["node_score"], dtype=np.float64)
-    if scores[depot] != 0:
-        raise ValueError(f"{path}: NODE_SCORE_SECTION gives the depot {scores[depot]:g}, but must give it 0; {_REMEDY}.")
     tasks = np.delete(np.arange(int(n_nodes)), depot)
     instances = Instances.from_arrays(
         depot=points[depot],
@@ -80,7 +79,8 @@ def read_oplib(path: Path, text: str, group: str) -> BenchmarkInstance:
         n_uavs=1,
         source=str(path),
     )
-    return BenchmarkInstance(path.stem, group, path, instances, tuple((tasks + 1).tolist()), is_rounded=True)
+    nodes = tuple((tasks + 1).tolist())
+    return BenchmarkInstance(path.stem, group, path, instances, nodes, is_rounded=True, depot_score=float(scores[depot]))
 
 
 def _specification(text: str, key: str) -> str:

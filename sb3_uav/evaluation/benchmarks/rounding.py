@@ -3,7 +3,7 @@ OPLib's rule for lengths: every edge counts with its Euclidean length rounded to
 
 Solvers see Euclidean lengths, by which the paper's checker accepts their schedules. Rounding makes a tour shorter or longer.
 One that the rule finds too long is shortened: first by reversing parts of it, then by leaving out tasks. Best-known values are
-compared with what remains.
+compared with what remains. On demand, the room that rounding leaves is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
 
-# Longer tours are shortened only by leaving out tasks: all pairs of their edges take too much memory.
+# Longer tours are shortened only by leaving out tasks, and not filled: all pairs of their edges take too much memory.
 _MOST_REVERSED = 2000
 RULE = "EUC_2D: the length of every edge is rounded to the nearest whole number"
 
@@ -87,6 +87,54 @@ def fit_to_rule(instance: Instances, schedule: Schedule) -> Schedule:
         tour = _shortened(np.arange(len(points)), points, worth, limit)
         routes.append([route[node - 1] for node in tour[1:].tolist()])
     return Schedule(routes)
+
+
+def fill(instance: Instances, schedule: Schedule) -> Schedule:
+    """
+    Use the room that rounding leaves: put in further tasks, the most valuable per length first, as long as the rule admits it.
+
+    :param instance: A batch of one, whose UAVs fly from the depot to the depot, equally far
+    :param schedule: A schedule that is feasible by the rule
+    :return: A schedule that is feasible by the rule; its Euclidean lengths may be greater than the limit
+    """
+    # Node 0 is the depot.
+    points = np.concatenate([instance.depot[0].numpy()[None], instance.tasks[0].numpy()])
+    worth = np.concatenate([[0.0], instance.values[0].numpy()])
+    left = np.flatnonzero(worth > 0)
+    left = left[~np.isin(left, [task + 1 for route in schedule.routes for task in route])]
+    routes = []
+    for route in schedule.routes:
+        tour = np.array([0, *(task + 1 for task in route)])
+        tour, left = _filled(tour, left, points, worth, float(instance.max_distance[0]))
+        routes.append((tour[1:] - 1).tolist())
+    return Schedule(routes)
+
+
+def _filled(
+    tour: np.ndarray, left: np.ndarray, points: np.ndarray, worth: np.ndarray, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param tour: ``(n,)``, nodes of a closed tour, the depot first
+    :param left: Nodes that may be put in
+    :param points: ``(n_nodes, 2)``
+    :param worth: ``(n_nodes,)``
+    :param limit: Greatest length
+    :return: The tour with some of these nodes, and the others
+    """
+    while len(left) > 0 and len(tour) <= _MOST_REVERSED:
+        tour = tour[_reversed_parts(np.arange(len(tour)), points[tour])]
+        here, after = points[tour][:, None], points[np.roll(tour, -1)][:, None]
+        new = points[left][None]
+        added = _rounded(here, new) + _rounded(new, after) - _rounded(here, after)
+        place, cost = added.argmin(0), added.min(0)
+        fits = cost <= limit - _length(tour, points)
+        if not fits.any():
+            break
+        # One that makes the tour no longer costs nothing.
+        best = int(np.where(fits, worth[left] / np.maximum(cost, 1e-9), -1.0).argmax())
+        tour = np.insert(tour, place[best] + 1, left[best])
+        left = np.delete(left, best)
+    return tour, left
 
 
 def _rounded(a: np.ndarray, b: np.ndarray) -> np.ndarray:

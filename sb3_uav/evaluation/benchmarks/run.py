@@ -29,6 +29,7 @@ def run_benchmark(
     time_limits: Sequence[float | None] = (None,),
     n_jobs: int = 1,
     resume: bool = False,
+    use_rounding: bool = False,
 ) -> list[GapRow]:
     """
     Run every solver on every instance of a benchmark, check all schedules, and compare them with the best-known values.
@@ -45,6 +46,7 @@ def run_benchmark(
     :param time_limits: As of :func:`~sb3_uav.evaluation.run.evaluate`
     :param n_jobs: As of :func:`~sb3_uav.evaluation.run.evaluate`
     :param resume: As of :func:`~sb3_uav.evaluation.run.evaluate`
+    :param use_rounding: Whether to put further tasks into tours of OPLib files where rounding leaves room for them
     :return: One row for every result in the folder
     :raises ValueError: If no instance has a best-known value, or as :func:`~sb3_uav.evaluation.run.evaluate` says
     """
@@ -66,7 +68,9 @@ def run_benchmark(
     sources = {name: batch_of(members) for name, members in sets.items()}
     evaluate(solvers, sources, folder, seed, on_progress, time_limits, n_jobs, resume=resume)
     with locked_folder(folder):
-        rows, routes = find_gaps(folder, [instance for members in sets.values() for instance in members], best_known)
+        rows, routes = find_gaps(
+            folder, [instance for members in sets.values() for instance in members], best_known, use_rounding
+        )
         write_gaps(folder, rows, routes)
         write_atomically(folder / SUMMARY_FILE, summary_text(benchmark, best_known, rows))
     return rows

@@ -45,16 +45,19 @@ def _some(names: Sequence[str]) -> str:
 def repairs(rows: Sequence[GapRow]) -> list[str]:
     """
     :param rows: Gaps
-    :return: How much the rounding rule took from each solver, one sentence each
+    :return: How much the rounding rule took from each solver, or added, one sentence each
     """
     lines = []
     for solver in dict.fromkeys(row.solver for row in rows):
-        dropped = [row for row in rows if row.solver == solver and row.n_dropped > 0]
-        if dropped:
-            n_tasks = sum(row.n_dropped for row in dropped)
-            lines.append(
-                f"{solver}: the rounding rule took {n_tasks} task{'s' * (n_tasks > 1)} from {len(dropped)} of its tours."
-            )
+        own = [row for row in rows if row.solver == solver]
+        for counts, what in (
+            ([row.n_dropped for row in own], "had to be left out of"),
+            ([row.n_added for row in own], "could be put into"),
+        ):
+            n_tasks, n_tours = sum(counts), sum(count > 0 for count in counts)
+            if n_tours:
+                tasks = "1 task" if n_tasks == 1 else f"{n_tasks} tasks"
+                lines.append(f"{solver}: by the rounding rule {tasks} {what} {n_tours} of its tours.")
     return lines
 
 
