@@ -19,7 +19,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
 
 # Longer tours are shortened only by leaving out tasks, and not filled: all pairs of their edges take too much memory.
-_MOST_REVERSED = 2000
+_MOST_REVERSED = 1000
 RULE = "EUC_2D: the length of every edge is rounded to the nearest whole number"
 
 
@@ -122,18 +122,21 @@ def _filled(
     :return: The tour with some of these nodes, and the others
     """
     while len(left) > 0 and len(tour) <= _MOST_REVERSED:
-        tour = tour[_reversed_parts(np.arange(len(tour)), points[tour])]
+        room = limit - _length(tour, points)
         here, after = points[tour][:, None], points[np.roll(tour, -1)][:, None]
         new = points[left][None]
         added = _rounded(here, new) + _rounded(new, after) - _rounded(here, after)
         place, cost = added.argmin(0), added.min(0)
-        fits = cost <= limit - _length(tour, points)
-        if not fits.any():
+        fits = cost <= room
+        if fits.any():
+            # One that makes the tour no longer costs nothing.
+            best = int(np.where(fits, worth[left] / np.maximum(cost, 1e-9), -1.0).argmax())
+            tour = np.insert(tour, place[best] + 1, left[best])
+            left = np.delete(left, best)
+            continue
+        tour = tour[_reversed_parts(np.arange(len(tour)), points[tour])]
+        if limit - _length(tour, points) <= room:
             break
-        # One that makes the tour no longer costs nothing.
-        best = int(np.where(fits, worth[left] / np.maximum(cost, 1e-9), -1.0).argmax())
-        tour = np.insert(tour, place[best] + 1, left[best])
-        left = np.delete(left, best)
     return tour, left
 
 
