@@ -126,6 +126,17 @@ def test_rounding_can_leave_room() -> None:
         check_schedule(shorter, 0, fill(shorter, Schedule([[0]])))
 
 
+def test_another_order_must_not_be_too_long_without_rounding() -> None:
+    tasks = [[3, 7], [3, 7], [3, 6], [8, 0], [5, 6]]
+    # As given it is 20.538 long, 21 by the rule; the other way round through the last four 20.583, and 20 by the rule.
+    instance = Instances.from_arrays([2.0, 8.0], tasks, np.ones(5), 20.55, 1)
+    fitted = fit_to_rule(instance, Schedule([[0, 1, 2, 3, 4]]))
+    check_schedule(instance, 0, fitted)
+    check_rounded(instance, fitted)
+    roomy = replace(instance, max_distance=instance.max_distance + 0.1)
+    assert fit_to_rule(roomy, Schedule([[0, 1, 2, 3, 4]])).routes == ((0, 4, 3, 2, 1),)
+
+
 @pytest.mark.parametrize("routes", [[[0], [1]], [[0, 0]], [[2]], [[-1]]])
 def test_the_rule_refuses_what_is_no_schedule(routes: list[list[int]]) -> None:
     with pytest.raises(InfeasibleScheduleError):
