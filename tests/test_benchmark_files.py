@@ -326,7 +326,7 @@ def test_best_known_values(tmp_path: Path) -> None:
     assert read_best_known(BEST_KNOWN)["b1.2.b"] == 0 and read_best_known(BEST_KNOWN)["road8"] == 27
     path = tmp_path / "values.csv"
     path.write_text(
-        '\ufeffsource, instance ,best_known\na table,x.1, 10\n\na table,x.2,2.5\nx.1,"b, c",10.0\n', encoding="utf-8"
+        '\ufeffinstance,source, best_known \nx.1,a table, 10\n\nx.2,a table,2.5\nx.1,"b, c",10.0\n', encoding="utf-8"
     )
     assert read_best_known(path) == {"x.1": 10.0, "x.2": 2.5}
 
