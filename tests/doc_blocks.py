@@ -100,6 +100,9 @@ RULES = [
     Rule("docs/fine_tuning.md", r"--epochs 29", "--epochs 1 --instances-per-epoch 16 --held-out 3"),
     Rule("docs/fine_tuning.md", r"--held-out 96", "--held-out 4"),
     Rule("docs/fine_tuning.md", r"(sb3-uav train .*) -i", rf"\1 {_SMALL.format('reinforce')} -i"),
+    # The files beside the tests have other names.
+    Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
+    Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),
     Rule("docs/results/*", r"U4-N80\.npz U6-N80\.npz \.\.\. \S+", "U4-N80.npz"),
     Rule("docs/results/*", r"U4-N500\.npz U6-N200\.npz", "U4-N80.npz"),
     Rule("docs/results/*", r"(time_limit|polish)=10?\b", r"\1=0.2"),
@@ -219,6 +222,8 @@ def prepare(folder: Path, page: str) -> None:
         (small / path.name).write_text(yaml.safe_dump(_shrunk(entries)), encoding="utf-8")
     if page.startswith("docs/comparison/"):
         _prepare_comparison(small)
+    if page == "docs/benchmarks.md":
+        shutil.copytree(ROOT / "tests" / "bench_files", folder / "top")
     if page.startswith("docs/results/"):
         from sb3_uav.envs import UniformGenerator
 

@@ -83,6 +83,14 @@ class Choosy(Stub):
             raise RuntimeError("the license is too small")
 
 
+class Fastidious(Stub):
+    """Refuses ways that end elsewhere than at the depot, and visits nothing."""
+
+    def check(self, instances: Instances) -> None:
+        if instances.end is not None:
+            raise ValueError("no open ways")
+
+
 class Mortal(OneByOneSolver):
     """Ends its process, or never ends, on instances whose depot lies at the given places."""
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmark_files import BEST_KNOWN, FILES
 
 pytest.importorskip("rl_zoo3")
 
@@ -57,6 +58,12 @@ CASES: list[tuple[list[str], list[str], str]] = [
     (EVERYTHING, ["compare", *ROUTING, "--out", "out"], "zoo"),
     (EVERYTHING, ["reproduce", "table1"], "plots"),
     (EVERYTHING, ["anytime", "."], "plots"),
+    (EVERYTHING, ["bench", ".", "--best-known", "b.csv", "--out", "out", "--solvers", "random-nearest"], "bench"),
+    (
+        ["vrplib"],
+        ["bench", str(FILES), "--best-known", str(BEST_KNOWN), "--out", "out", "--solvers", "random-nearest"],
+        "bench",
+    ),
     (["yaml"], ["train", *ROUTING], "zoo"),
     (["rl_zoo3"], ["train", *ROUTING], "zoo"),
     (["optuna"], ["train", *ROUTING], "zoo"),

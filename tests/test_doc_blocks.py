@@ -106,7 +106,15 @@ def check_fine_tuning(folder: Path, variables: dict[str, Any]) -> None:
     assert sum("sb3:zip=" in row for row in rows) == 2 * 16
 
 
+def check_benchmarks(folder: Path, variables: dict[str, Any]) -> None:
+    rows = (folder / "results" / "p7" / "gaps.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 1 + 2 * 4 and all(",ok," in row for row in rows[1:])
+    assert (folder / "results" / "p7" / "anytime.png").is_file()
+    assert [row.instance for row in variables["rows"]] == ["a1.2.a", "a1.2.b"]
+
+
 CHECKS: dict[str, Check] = {
+    "docs/benchmarks.md": check_benchmarks,
     "docs/fine_tuning.md": check_fine_tuning,
     "README.md": check_readme,
     "docs/training.md": check_training,

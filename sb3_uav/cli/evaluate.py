@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_uav.cli.solver_specs import solvers_of
 from sb3_uav.common.optional import install_command
 
 if TYPE_CHECKING:
@@ -112,8 +113,7 @@ def _make_solvers(args: argparse.Namespace) -> list[Solver]:
     :raises OSError: If a zip of the trained pair is missing, or of the only solver
     :raises ValueError: If a zip of it is damaged, or another argument is not allowed
     """
-    from sb3_uav.solvers import make_solver
-    from sb3_uav.solvers.unavailable import UnavailableError, UnavailableSolver
+    from sb3_uav.solvers.unavailable import UnavailableSolver
 
     if (args.allocator is None) != (args.router is None):
         missing = "--allocator" if args.allocator is None else "--router"
@@ -126,14 +126,8 @@ def _make_solvers(args: argparse.Namespace) -> list[Solver]:
         solvers += [trained, trained.untrained(args.seed)] if args.untrained else [trained]
     elif args.untrained:
         raise ValueError("--untrained needs --allocator and --router, which say what the networks look like.")
-    wrong: list[Exception] = []
-    for spec in args.solvers:
-        try:
-            solvers.append(make_solver(spec, device=args.device, batch_size=args.batch_size))
-        except (ImportError, ValueError, OSError) as error:
-            # The others can do without it.
-            solvers.append(UnavailableSolver(spec, str(error)))
-            wrong += [] if isinstance(error, ImportError | UnavailableError) else [error]
+    more, wrong = solvers_of(args.solvers, args.device, args.batch_size)
+    solvers += more
     if not solvers:
         raise ValueError("There is nothing to evaluate: give --allocator with --router, or --solvers.")
     if wrong and all(isinstance(solver, UnavailableSolver) for solver in solvers):

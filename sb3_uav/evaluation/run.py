@@ -150,15 +150,19 @@ def _refusals(solvers: Sequence[Solver], sources: Mapping[str, Instances]) -> di
     :raises ValueError: If no solver can solve anything
     """
     refusals = {}
+    reasons: dict[tuple[str, str], list[str]] = {}
     for source, batch in sources.items():
         for solver in solvers:
             try:
                 solver.check(batch)
             except Exception as error:
                 # Any exception: the other solvers are still evaluated.
-                refusals[source, solver.name] = Failure.of(error).message
+                why = refusals[source, solver.name] = Failure.of(error).message
+                reasons.setdefault((solver.name, why), []).append(source)
     if len(refusals) == len(solvers) * len(sources):
         raise ValueError(
-            " ".join(f"{source}: {solver} cannot solve these instances: {why}" for (source, solver), why in refusals.items())
+            " ".join(
+                f"{'; '.join(sets)}: {solver} cannot solve these instances: {why}" for (solver, why), sets in reasons.items()
+            )
         )
     return refusals

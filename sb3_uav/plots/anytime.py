@@ -17,18 +17,18 @@ from sb3_uav.evaluation.results import OK, RESULTS_FILE, ResultRow, read_results
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 from sb3_uav.plots.style import DASHED, MARKERS, SERIES_COLORS, style_axes
 
-_PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
+PANEL_WIDTH, PANEL_HEIGHT = 7.2, 4.4
 _LEGEND_WIDTH = 34
 _FOOTNOTE = "Bands and bars: 95 % confidence of the shortfall from the best objective found on the same instance"
 
 
-class _Curve(NamedTuple):
+class Curve(NamedTuple):
     """
     The results of one solver on one set of instances.
 
     :param solver: Name of the solver
     :param seconds: ``(n_points,)``, mean wall time per instance, in ascending order
-    :param objective: ``(n_points,)``, mean objective
+    :param objective: ``(n_points,)``, mean objective, or another mean
     :param halfwidth: ``(n_points,)``, half of its confidence interval
     :param batch_size: How many instances were solved at once
     """
@@ -40,7 +40,7 @@ class _Curve(NamedTuple):
     batch_size: int
 
 
-class _Panel(NamedTuple):
+class Panel(NamedTuple):
     """
     :param source: Name of the set of instances
     :param n_instances: Number of instances
@@ -50,7 +50,7 @@ class _Panel(NamedTuple):
 
     source: str
     n_instances: int
-    curves: list[_Curve]
+    curves: list[Curve]
     left_out: list[str]
 
 
@@ -88,16 +88,16 @@ def plot_anytime(
     if not any(panel.curves for panel in panels):
         raise ValueError(f"{file}: no solver has solved all instances of a set; there is nothing to draw.")
     numbers = {solver: number for number, solver in enumerate(known)}
-    figure = new_figure(_PANEL_WIDTH, PANEL_HEIGHT * len(panels))
+    figure = new_figure(PANEL_WIDTH, PANEL_HEIGHT * len(panels))
     for axes, panel in zip(figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
-        _draw_panel(axes, panel, numbers)
+        draw_panel(axes, panel, numbers)
     figure.supxlabel(_FOOTNOTE, fontsize=7.5, color="0.4")
     for path in checked:
         save_figure(figure, path)
     return checked
 
 
-def _anytime_panels(rows: Sequence[ResultRow]) -> list[_Panel]:
+def _anytime_panels(rows: Sequence[ResultRow]) -> list[Panel]:
     """
     :param rows: Results of an evaluation
     :return: What to draw, in the order of the results
@@ -105,7 +105,7 @@ def _anytime_panels(rows: Sequence[ResultRow]) -> list[_Panel]:
     return [_panel([row for row in rows if row.source == source]) for source in _unique(row.source for row in rows)]
 
 
-def _panel(rows: Sequence[ResultRow]) -> _Panel:
+def _panel(rows: Sequence[ResultRow]) -> Panel:
     """
     :param rows: Results of one set of instances
     :return: Its panel
@@ -132,8 +132,8 @@ def _panel(rows: Sequence[ResultRow]) -> _Panel:
         )
         seconds, objective, halfwidth = np.array(points).T
         batch_size = max(row.batch_size or 1 for key in keys for row in runs[key])
-        curves.append(_Curve(solver, seconds, objective, halfwidth, batch_size))
-    return _Panel(rows[0].source, len(instances), curves, left_out)
+        curves.append(Curve(solver, seconds, objective, halfwidth, batch_size))
+    return Panel(rows[0].source, len(instances), curves, left_out)
 
 
 def _per_instance(rows: Sequence[ResultRow], instances: Sequence[int]) -> np.ndarray:
@@ -163,15 +163,19 @@ def _solver_style(number: int) -> dict[str, str]:
     return {"color": SERIES_COLORS[number % n_colors], "marker": MARKERS[(number + number // n_colors) % len(MARKERS)]}
 
 
-def _draw_panel(axes: Any, panel: _Panel, numbers: dict[str, int]) -> None:
+def draw_panel(
+    axes: Any, panel: Panel, numbers: dict[str, int], label: str = "objective (mean)", less_is_better: bool = False
+) -> None:
     """
     :param axes: matplotlib axes
     :param panel: What to draw
     :param numbers: Number of every solver, which determines its color and marker
+    :param label: What the curves show
+    :param less_is_better: Whether the lowest curve is the best
     """
     ticker = require_matplotlib().ticker
     title = f"{panel.source}: {panel.n_instances} instances"
-    style_axes(axes, title, "seconds per instance (mean)", "objective (mean)", "both")
+    style_axes(axes, title, "seconds per instance (mean)", label, "both")
     axes.set_xscale("log")
     times = np.concatenate([curve.seconds for curve in panel.curves]) if panel.curves else np.ones(1)
     # Leave room on both sides of a single point, and for the dashed lines.
@@ -182,17 +186,18 @@ def _draw_panel(axes: Any, panel: _Panel, numbers: dict[str, int]) -> None:
     axes.xaxis.set_minor_formatter(ticker.NullFormatter())
     axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda seconds, _: f"{seconds:g}"))
     # The legend lists the best solver first, as in the panel.
-    for curve in sorted(panel.curves, key=lambda curve: -curve.objective.max()):
+    sign = 1 if less_is_better else -1
+    for curve in sorted(panel.curves, key=lambda curve: float((sign * curve.objective).min())):
         look = _solver_style(numbers[curve.solver])
         name = textwrap.fill(curve.solver.replace(",", ", "), _LEGEND_WIDTH, break_on_hyphens=False)
-        label = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
+        entry = name if curve.batch_size == 1 else f"{name}\n(batches of {curve.batch_size})"
         low, high = curve.objective - curve.halfwidth, curve.objective + curve.halfwidth
         if len(curve.seconds) > 1:
-            axes.plot(curve.seconds, curve.objective, **look, linewidth=1.6, markersize=5, label=label)
+            axes.plot(curve.seconds, curve.objective, **look, linewidth=1.6, markersize=5, label=entry)
             axes.fill_between(curve.seconds, low, high, color=look["color"], alpha=0.15, linewidth=0)
         else:
             until = axes.get_xlim()[1]
-            axes.plot(curve.seconds, curve.objective, **look, linestyle="none", markersize=6, label=label)
+            axes.plot(curve.seconds, curve.objective, **look, linestyle="none", markersize=6, label=entry)
             axes.hlines(curve.objective, curve.seconds, until, color=look["color"], linestyle=DASHED, linewidth=1.2)
             axes.vlines(curve.seconds, low, high, color=look["color"], linewidth=1.2)
     if panel.curves:

@@ -1,0 +1,76 @@
+"""Running solvers on the files of a public benchmark, and comparing them with best-known values."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sb3_uav.common.files import write_atomically
+from sb3_uav.evaluation.benchmarks.collection import BenchmarkFolder, batch_of, evaluation_sets
+from sb3_uav.evaluation.benchmarks.gaps import GAPS_FILE, ROUTES_FILE, GapRow, find_gaps, write_gaps
+from sb3_uav.evaluation.benchmarks.summary_file import SUMMARY_FILE, summary_text
+from sb3_uav.evaluation.locking import locked_folder
+from sb3_uav.evaluation.run import evaluate
+from sb3_uav.evaluation.set_evaluation import Progress
+from sb3_uav.solvers.base import Solver
+
+# Drawn by the command, if there are several time limits.
+CURVE_FILE = "anytime.png"
+
+
+def run_benchmark(
+    solvers: Sequence[Solver],
+    benchmark: BenchmarkFolder,
+    best_known: Mapping[str, float],
+    out_dir: str | os.PathLike[str],
+    seed: int = 0,
+    progress: Progress | None = None,
+    time_limits: Sequence[float | None] = (None,),
+    n_jobs: int = 1,
+    resume: bool = False,
+    use_rounding: bool = False,
+) -> list[GapRow]:
+    """
+    Run every solver on every instance of a benchmark, check all schedules, and compare them with the best-known values.
+
+    Writes what :func:`~sb3_uav.evaluation.run.evaluate` writes, and at the end ``gaps.csv``, ``routes.jsonl`` and
+    ``summary.md``, which cover all results in the folder.
+
+    :param solvers: The solvers, with different names
+    :param benchmark: What :func:`~sb3_uav.evaluation.benchmarks.collection.read_folder` returned
+    :param best_known: Best-known values by the name of the instance
+    :param out_dir: Folder of the files, created if missing
+    :param seed: Seed of the solvers
+    :param progress: As of :func:`~sb3_uav.evaluation.run.evaluate`
+    :param time_limits: As of :func:`~sb3_uav.evaluation.run.evaluate`
+    :param n_jobs: As of :func:`~sb3_uav.evaluation.run.evaluate`
+    :param resume: As of :func:`~sb3_uav.evaluation.run.evaluate`
+    :param use_rounding: Whether to put further tasks into tours of OPLib files where rounding leaves room for them
+    :return: One row for every result in the folder
+    :raises ValueError: If no instance has a best-known value, or as :func:`~sb3_uav.evaluation.run.evaluate` says
+    """
+    if not set(best_known) & set(benchmark.instances):
+        raise ValueError(
+            f"{benchmark.path}: none of its instances has a best-known value; they have names like "
+            f"{next(iter(benchmark.instances))!r}, the best-known values like {next(iter(best_known), '')!r}."
+        )
+    sets = evaluation_sets(list(benchmark.instances.values()))
+    folder = Path(out_dir)
+
+    def on_progress(text: str, n_done: int, n_total: int) -> None:
+        # Not before: the folder may turn out to hold something else. These files describe the earlier results.
+        for name in (GAPS_FILE, ROUTES_FILE, SUMMARY_FILE, CURVE_FILE):
+            (folder / name).unlink(missing_ok=True)
+        if progress is not None:
+            progress(text, n_done, n_total)
+
+    sources = {name: batch_of(members) for name, members in sets.items()}
+    evaluate(solvers, sources, folder, seed, on_progress, time_limits, n_jobs, resume=resume)
+    with locked_folder(folder):
+        rows, routes = find_gaps(
+            folder, [instance for members in sets.values() for instance in members], best_known, use_rounding
+        )
+        write_gaps(folder, rows, routes)
+        write_atomically(folder / SUMMARY_FILE, summary_text(benchmark, best_known, rows))
+    return rows
