@@ -8,13 +8,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_uav.common.equal_rows import equal_rows
 from sb3_uav.envs.customization import is_drawable, make_reward, make_router, make_source, try_reward, try_router
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem, Stage
 from sb3_uav.envs.rewards import Reward, at_the_end, score_tours
-from sb3_uav.envs.routing import DEPOT, Router, collected_value, nearest_feasible
+from sb3_uav.envs.routing import DEPOT, Router, collected_value, is_deterministic, nearest_feasible
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.envs.sweep import sweep_order
 
@@ -170,21 +171,51 @@ class PlannedTours(NamedTuple):
     value: th.Tensor
 
 
-def plan_tours(instances: Instances, assignment: th.Tensor, router: Router) -> PlannedTours:
+def plan_tours(instances: Instances, assignment: th.Tensor, router: Router, copy_of: th.Tensor | None = None) -> PlannedTours:
     """
     Plan every UAV's tour over its assigned tasks with a router.
+
+    Where several samples give a UAV the same tasks, a router that is marked as
+    :func:`~sb3_uav.envs.routing.deterministic` plans one tour for all of them.
 
     :param instances: ``batch`` instances
     :param assignment: ``(batch, n_samples, n_tasks)`` int64
     :param router: Plans one tour per row
+    :param copy_of: ``(batch,)`` int64, equal for rows that hold the same instance; they are all different when None
     :return: The tours and the value that they collect
     """
     shape = (*assignment.shape[:2], instances.n_uavs)
     subsets = split_tasks(instances, assignment)
+    kind = None
+    if is_deterministic(router):
+        if copy_of is None:
+            copy_of = th.arange(len(instances), device=assignment.device)
+        rows, kind = equal_rows(_contents(instances, subsets, copy_of, shape[1]))
+        if len(rows) < len(kind):
+            subsets = Subsets(subsets.instances[rows], subsets.task_index[rows])
+        else:
+            kind = None
     nodes = router(subsets.instances).to(assignment.device)
-    value = collected_value(subsets.instances, nodes).view(shape).sum(-1)
+    value = collected_value(subsets.instances, nodes)
     tours = subsets.task_index.gather(1, (nodes - 1).clamp(min=0)).masked_fill(nodes == DEPOT, -1)
-    return PlannedTours(tours.view(*shape, nodes.shape[1]), value)
+    if kind is not None:
+        value, tours = value[kind], tours[kind]
+    return PlannedTours(tours.view(*shape, nodes.shape[1]), value.view(shape).sum(-1))
+
+
+def _contents(instances: Instances, subsets: Subsets, copy_of: th.Tensor, n_samples: int) -> th.Tensor:
+    """
+    :param instances: ``batch`` instances
+    :param subsets: Their subsets
+    :param copy_of: ``(batch,)`` int64, which instance each row holds
+    :param n_samples: Allocations per instance
+    :return: ``(batch * n_samples * n_uavs, n_columns)`` int64, equal for subsets that a router cannot tell apart
+    """
+    tasks = subsets.task_index.masked_fill(~subsets.instances.task_mask, -1)
+    n_uavs = instances.n_uavs
+    uav = th.arange(n_uavs, device=tasks.device) * (not instances.has_equal_uavs)
+    owner = th.stack([copy_of.repeat_interleave(n_samples * n_uavs), uav.repeat(len(instances) * n_samples)], dim=1)
+    return th.cat([owner, tasks], dim=1)
 
 
 def _useful_allocation(instances: Instances, assignment: th.Tensor) -> tuple[Instances, th.Tensor]:
@@ -244,6 +275,24 @@ def schedules(tours: th.Tensor) -> list[Schedule]:
     return [Schedule([[task for task in tour if task >= 0] for tour in row]) for row in tours.tolist()]
 
 
+class _CurrentRouter:
+    """
+    The router of a problem, looked up at every call, so that one set during an episode takes effect.
+
+    :param problem: The problem
+    """
+
+    def __init__(self, problem: AllocationProblem) -> None:
+        self.problem = problem
+
+    @property
+    def is_deterministic(self) -> bool:
+        return is_deterministic(self.problem.router)
+
+    def __call__(self, subsets: Instances) -> th.Tensor:
+        return self.problem.router(subsets)
+
+
 class AllocationProblem(Problem):
     """
     Task allocation: each step assigns one task to a UAV; the reward comes at the end.
@@ -294,8 +343,7 @@ class AllocationProblem(Problem):
         }
 
     def dynamics(self, instances: Instances) -> AllocationDynamics:
-        # Looked up at every call, so that a router set during an episode takes effect.
-        return AllocationDynamics(instances, lambda subsets: self.router(subsets), self.reward)
+        return AllocationDynamics(instances, _CurrentRouter(self), self.reward)
 
     def observe(self, dynamics: AllocationDynamics, state: AllocationState) -> dict[str, th.Tensor]:
         return {

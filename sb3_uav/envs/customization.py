@@ -22,7 +22,8 @@ A mapping from the path to further arguments passes those too, as for callbacks 
 
 Whatever is given is tried out on two instances when the environment is made, without touching any random stream. But nothing
 is drawn from a generator that is given as an object, which may have a state of its own. All four work in both drivers. With a
-reward of the user, episodes have no ``is_success``, which is about the values of tasks.
+reward of the user, episodes have no ``is_success``, which is about the values of tasks. A router that plans equal rows alike
+can be marked with :func:`~sb3_uav.envs.routing.deterministic`: subsets that several samples share are then planned once.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -22,6 +22,26 @@ DEPOT = 0
 # Plans one tour per row: Instances -> (batch, n_steps) int64 node indices, task j being node j + 1; DEPOT at the end and as
 # padding.
 Router = Callable[[Instances], th.Tensor]
+RouterT = TypeVar("RouterT", bound=Callable[..., th.Tensor])
+
+
+def deterministic(router: RouterT) -> RouterT:
+    """
+    Mark a router that plans equal rows alike, so that of equal subsets only one is planned.
+
+    :param router: The router
+    :return: The same
+    """
+    router.is_deterministic = True  # type: ignore[attr-defined]
+    return router
+
+
+def is_deterministic(router: Router) -> bool:
+    """
+    :param router: Any router
+    :return: Whether it is marked as one that plans equal rows alike
+    """
+    return bool(getattr(router, "is_deterministic", False))
 
 
 class RoutingState(NamedTuple):
@@ -134,6 +154,7 @@ class _ScoredDynamics(RoutingDynamics):
         return TourState(*after, tour), rewards
 
 
+@deterministic
 def nearest_feasible(instances: Instances) -> th.Tensor:
     """
     Always fly to the nearest task that is still feasible; the default router of allocation environments.

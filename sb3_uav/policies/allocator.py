@@ -275,6 +275,31 @@ class AllocatorPolicy(EpisodicPolicy):
             return super().task_order(instances)
         return sweep_order(instances, gap=variant // 2, clockwise=variant % 2 == 1)
 
+    @th.no_grad()
+    def encode_nodes(self, instances: Instances) -> th.Tensor:
+        """
+        Encode instances that are to be shown in several orders, see :meth:`arranged_cache`, in evaluation mode.
+
+        :param instances: ``batch`` instances on the device of the policy
+        :return: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
+        """
+        self.set_training_mode(False)
+        return self.features_extractor.encode_nodes(StaticObservation.from_instances(instances))
+
+    @th.no_grad()
+    def arranged_cache(self, nodes: th.Tensor, order: th.Tensor, arranged: Instances) -> Cache:
+        """
+        The encodings of instances whose tasks were put into another order, without encoding them again: the encoder treats
+        all tasks alike. Equal to :meth:`encode` but for rounding.
+
+        :param nodes: ``(batch, n_tasks + 1, embed_dim)``, from :meth:`encode_nodes`
+        :param order: ``(batch, n_tasks)`` int64, which task stands in each place
+        :param arranged: The instances in this order
+        :return: Their encodings
+        """
+        index = nn.functional.pad(order + 1, (1, 0))[..., None].expand(-1, -1, nodes.shape[-1])
+        return self.features_extractor.precompute(nodes.gather(1, index), StaticObservation.from_instances(arranged))
+
     def check_fleet(self, instances: Instances) -> None:
         """
         :raises ValueError: If the instances have another number of UAVs than the network

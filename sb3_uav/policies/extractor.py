@@ -163,9 +163,16 @@ class EncodeOnceExtractor(BaseFeaturesExtractor):
         :param static: The static part of ``batch`` observations
         :return: Their encodings, the network's :class:`Cache`
         """
+        return self.precompute(self.encode_nodes(static), static)
+
+    def encode_nodes(self, static: Any) -> th.Tensor:
+        """
+        :param static: The static part of ``batch`` observations
+        :return: Their node embeddings alone, ``(batch, n_nodes, embed_dim)``
+        """
         if not is_recorded():
             self.n_encoded_rows += len(static[0])
-        return self.precompute(self.encoder(static), static)
+        return self.encoder(static)
 
     def forward(self, observations: TensorDict) -> th.Tensor:
         """

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value
+from sb3_uav.envs.routing import DEPOT, RoutingDynamics, RoutingProblem, RoutingState, collected_value, deterministic
 from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.encoder import attend
 from sb3_uav.policies.extractor import Cache, EpisodicExtractor
@@ -237,6 +237,8 @@ class RouterPolicy(EpisodicPolicy):
         stacked = RouterState(*(th.stack(field, dim=2).flatten(1, 2) for field in zip(*states, strict=True)))
         return stacked, stacked.action_mask
 
+    # Greedy, unless it is called with more than a router's one argument.
+    @deterministic
     @th.no_grad()
     def plan(
         self,

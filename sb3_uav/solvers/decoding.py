@@ -12,8 +12,9 @@ from sb3_uav.common.random_streams import mixed_state
 from sb3_uav.envs.allocation import plan_tours
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
-from sb3_uav.envs.symmetries import N_SYMMETRIES, reflect
+from sb3_uav.envs.symmetries import N_SYMMETRIES
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.solvers.seen_instances import SeenInstance, Shown, View
 from sb3_uav.solvers.shortlists import Block
 
 DECODINGS = ("greedy", "sampling", "augment")
@@ -34,18 +35,6 @@ _N_REVISITED, REVISITED_PART = 4, 0.25
 _HURRIED_BLOCK, _HURRIED_VIEWS = 16, 2
 
 
-class View(NamedTuple):
-    """
-    A way to look at an instance.
-
-    :param symmetry: Symmetry of the square, 0 for none
-    :param sweep: Where the sweep starts and in which direction, as of the allocator's ``task_order``
-    """
-
-    symmetry: int
-    sweep: int
-
-
 def _view_of(number: int) -> View:
     """
     :param number: Number of an allocation in augmentation, from 0
@@ -57,15 +46,15 @@ def _view_of(number: int) -> View:
 
 class Allocations(NamedTuple):
     """
-    Several allocations of one instance.
+    Several allocations of one instance, tasks in the order of the input.
 
-    :param instances: The instance, repeated ``n_allocations`` times, as the allocator saw it
-    :param order: ``(n_allocations, n_tasks)`` int64, which task stands in each place
-    :param assignment: ``(n_allocations, n_tasks)`` int64, the UAV of the task in each place
+    :param instances: The instance, repeated ``n_allocations`` times, with the symmetry that the allocator saw
+    :param symmetry: ``(n_allocations,)`` int64, that symmetry
+    :param assignment: ``(n_allocations, n_tasks)`` int64, the UAV of each task
     """
 
     instances: Instances
-    order: th.Tensor
+    symmetry: th.Tensor
     assignment: th.Tensor
 
     def first(self, n_allocations: int) -> Allocations:
@@ -73,11 +62,7 @@ class Allocations(NamedTuple):
         :param n_allocations: How many to keep
         :return: The first of the allocations
         """
-        return Allocations(self.instances[:n_allocations], self.order[:n_allocations], self.assignment[:n_allocations])
-
-    def in_input_order(self) -> th.Tensor:
-        """:return: ``(n_allocations, n_tasks)`` int64, the UAV of each task"""
-        return th.empty_like(self.assignment).scatter_(1, self.order, self.assignment)
+        return Allocations(self.instances[:n_allocations], self.symmetry[:n_allocations], self.assignment[:n_allocations])
 
 
 class Decoder:
@@ -112,10 +97,11 @@ class Decoder:
         if self.decode == "sampling":
             size = _HURRIED_BLOCK if hurry else SAMPLE_BLOCK
             views = [View(0, sweep) for sweep in range(_N_SWEEPS if self.allocator.sweep else 1)]
+            shown = [seen.show(views) for seen in self._seen(instances)]
             for first in range(0, self.samples, size):
                 looks = [
-                    self.look(instances[i], views, _random_generator(instances, seed, row, first), size // len(views))
-                    for i, row in enumerate(rows)
+                    self.look(views_of_row, _random_generator(instances, seed, row, first), size // len(views))
+                    for views_of_row, row in zip(shown, rows, strict=True)
                 ]
                 yield self._plan([look.first(self.samples - first) for look in looks])
         elif self.decode == "augment":
@@ -134,15 +120,16 @@ class Decoder:
         n_allocations = self.samples - (_N_REVISITED * n_tours if n_tours > 1 else 0)
         size = _HURRIED_VIEWS if hurry else _N_VIEWS
         values, assignments = [], []
+        seen = self._seen(instances)
         for first in range(0, n_allocations, size):
             views = [_view_of(number) for number in range(first, min(first + size, n_allocations))]
             looks = [
-                self.look(instances[i], views, _random_generator(instances, seed, row, first), int(first >= _N_VIEWS))
-                for i, row in enumerate(rows)
+                self.look(instance.show(views), _random_generator(instances, seed, row, first), int(first >= _N_VIEWS))
+                for instance, row in zip(seen, rows, strict=True)
             ]
             block = self._plan(looks)
             values.append(block.value)
-            assignments.append(th.stack([look.in_input_order() for look in looks]))
+            assignments.append(th.stack([look.assignment for look in looks]))
             yield block
         if n_tours > 1:
             best = th.cat(values, dim=1).sort(dim=1, descending=True, stable=True).indices[:, :_N_REVISITED]
@@ -162,30 +149,33 @@ class Decoder:
         """
         return lambda subsets: self.router.plan(subsets, None, n_tours, generator)
 
-    def look(self, instance: Instances, views: Sequence[View], generator: th.Generator, n_samples: int = 0) -> Allocations:
+    def _seen(self, instances: Instances) -> list[SeenInstance]:
+        return [SeenInstance(self.allocator, instances[i]) for i in range(len(instances))]
+
+    def look(self, shown: Shown, generator: th.Generator, n_samples: int = 0) -> Allocations:
         """
-        :param instance: A batch of one on the allocator's device
-        :param views: Its views
+        :param shown: An instance in several views
         :param generator: The source of randomness
         :param n_samples: How many allocations to sample in each view; 0 to decode one greedily
         :return: The first sample of each view, then the second of each, and so on
         """
-        shown = [reflect(instance, view.symmetry) for view in views]
-        orders = th.cat([self.allocator.task_order(seen, view.sweep) for view, seen in zip(views, shown, strict=True)])
-        arranged = Instances.concatenate(shown).reorder(orders)
-        assignment = self.allocator.decode_episodes(arranged, max(n_samples, 1), n_samples == 0, generator)
-        view = th.arange(len(views), device=orders.device).repeat(assignment.shape[1])
-        return Allocations(arranged[view], orders[view], assignment.transpose(0, 1).flatten(0, 1))
+        assignment = self.allocator.decode_episodes(shown.instances, max(n_samples, 1), n_samples == 0, generator, shown.cache)
+        view = th.arange(len(shown.order), device=assignment.device).repeat(assignment.shape[1])
+        in_places = assignment.transpose(0, 1).flatten(0, 1)
+        in_input_order = th.empty_like(in_places).scatter_(1, shown.order[view], in_places)
+        return Allocations(shown.reflected[view], shown.symmetry[view], in_input_order)
 
     def _plan(self, looks: Sequence[Allocations]) -> Block:
         """
         :param looks: Allocations of each instance, equally many
         :return: Their schedules
         """
-        instances, order = Instances.concatenate([look.instances for look in looks]), th.cat([look.order for look in looks])
-        planned = plan_tours(instances, th.cat([look.assignment for look in looks])[:, None], self.router.plan)
-        tours = _tours_of_tasks(planned.tours, order)
-        return Block(planned.value.view(len(looks), -1), tours.view(len(looks), -1, *tours.shape[2:]))
+        instances = Instances.concatenate([look.instances for look in looks])
+        assignment = th.cat([look.assignment for look in looks])[:, None]
+        # Allocations in the same view share subsets, whatever the sweep.
+        copy_of = th.cat([N_SYMMETRIES * number + look.symmetry for number, look in enumerate(looks)])
+        planned = plan_tours(instances, assignment, self.router.plan, copy_of)
+        return Block(planned.value.view(len(looks), -1), planned.tours.view(len(looks), -1, *planned.tours.shape[2:]))
 
 
 def _random_generator(instances: Instances, *seed: int) -> th.Generator:
