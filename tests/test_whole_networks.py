@@ -181,7 +181,7 @@ def test_observations_show_the_whole_problem_where_there_is_more() -> None:
         n_uavs = 3 if isinstance(env, TaskAllocationEnv) else 1
         assert observation["uav_start"].reshape(-1, 2).tolist() == instances.uav_start[0, :n_uavs].float().tolist()
         assert observation["service"].tolist() == instances.service_cost[0].float().tolist()
-    assert not set(WHOLE_KEYS) & set(TaskAllocationEnv(5, 2).observation_space.spaces)
+    assert not set(WHOLE_KEYS) & set(TaskAllocationEnv(5, 2).problem.observation_space.spaces)
     with pytest.raises(ValueError, match=r"The instance has max_distance per UAV, start, .*observations.*do not show"):
         TaskAllocationEnv(9, 3).reset(options={"instance": instances})
 
