@@ -34,6 +34,8 @@ NOWHERE = 1e300
 MAX_SEGMENT = 3
 # A task is dear to a tour if it is worth more than so many average tasks of it: less is won by taking short strings out.
 DEAR = 3
+# Probability that no task may be inserted into one of the tours, where UAVs differ.
+CLOSED = 0.2
 
 
 # What is known of a node: where it is, what it is worth, and what serving it costs; by whom it is visited, -1 if by none, and
@@ -69,10 +71,10 @@ TOUR = np.dtype(
     ],
     align=True,
 )
-# The number of tasks, the largest value that is not out of the ordinary, the number of trials so far, and the state of the
-# random numbers.
+# The number of tasks, whether all tours have the same terminals and limits, the largest value that is not out of the
+# ordinary, the number of trials so far, and the state of the random numbers.
 STATE = np.dtype(
-    [("n_tasks", np.int64), ("ordinary", np.float64), ("clock", np.int64), ("random", np.uint64)],
+    [("n_tasks", np.int64), ("equal", np.int64), ("ordinary", np.float64), ("clock", np.int64), ("random", np.uint64)],
     align=True,
 )
 # Rows of Plan.lists.
@@ -845,6 +847,11 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
         n_candidates = enter(plan, n_candidates, task, blink, spread)
         if plan.nodes[task].noise > 0.0:
             look_around(plan, task, n_near)
+    if not plan.state[0].equal:
+        # No string is ever taken out of an empty tour, so this is the only way to fill it with tasks that wait.
+        for v in range(len(plan.tours)):
+            if plan.tours[v].size == 0 and plan.tours[v].length <= plan.tours[v].limit:
+                n_touched = keep(plan, n_touched, v)
     for i in range(n_touched):
         v = plan.lists[TOUCHED, i]
         route = plan.routes[v]
@@ -939,12 +946,14 @@ def make_room(plan, task, v, keep_rest):
 
 
 @njit(cache=True, nogil=True)
-def admit_dear(plan, n_near):
+def admit(plan, n_near):
     """
-    Empty tours, or a part of them, for unvisited tasks that are dear to them, and fill them again, wherever that is worth more.
+    Make room for unvisited tasks and insert what had to leave elsewhere, wherever that is worth more; returns how often.
+
+    For a task that is dear to a tour all of it may leave. Where UAVs are equal, only such tasks are tried: the others come in
+    where strings are taken out.
 
     :param n_near: Beside how many neighbors a task may be inserted
-    :return: How often
     """
     count = 0
     for task in range(1, plan.state[0].n_tasks + 1):
@@ -955,12 +964,13 @@ def admit_dear(plan, n_near):
             value = 0.0
             for p in range(1, size + 1):
                 value += plan.nodes[plan.routes[v, p]].value
-            if plan.nodes[task].value * size <= value * min(size, DEAR):
-                continue
+            is_dear = plan.nodes[task].value * size > value * min(size, DEAR)
             alone = distance(plan, plan.routes[v, 0], task) + distance(plan, task, plan.routes[v, size + 1])
-            if alone + plan.nodes[task].service > plan.tours[v].limit:
+            if alone + plan.nodes[task].service > plan.tours[v].limit or (plan.state[0].equal and not is_dear):
                 continue
             for keep_rest in (True, False):
+                if not keep_rest and not is_dear:
+                    break
                 plan.state[0].clock += 1
                 n_touched = keep(plan, 0, v)
                 n_removed = make_room(plan, task, v, keep_rest)
@@ -971,8 +981,6 @@ def admit_dear(plan, n_near):
                     count += 1
                     break
                 put_back(plan, n_touched)
-                if n_removed < 0:
-                    break
     return count
 
 
@@ -999,7 +1007,7 @@ def descend(plan, n_near_joined, n_near_inserted, max_string):
         return True
     if changed or max_string == 0:
         return changed
-    return eject(plan, n_near_inserted, max_string) > 0 or admit_dear(plan, n_near_inserted) > 0
+    return eject(plan, n_near_inserted, max_string) > 0 or admit(plan, n_near_inserted) > 0
 
 
 @njit(cache=True, nogil=True)
@@ -1046,13 +1054,22 @@ def ruin_around(plan, mean_removed, longest):
 
 
 @njit(cache=True, nogil=True)
-def extraordinary_value(plan):
-    """What the visited tasks are worth beyond the ordinary: it does not count for how dear length is."""
+def extraordinary_value(plan, visited):
+    """What visited or unvisited tasks are worth beyond the ordinary."""
     total = 0.0
     for task in range(1, plan.state[0].n_tasks + 1):
-        if plan.nodes[task].owner >= 0:
+        if (plan.nodes[task].owner >= 0) == visited:
             total += max(plan.nodes[task].value - plan.state[0].ordinary, 0.0)
     return total
+
+
+@njit(cache=True, nogil=True)
+def copy_routes(source, target):
+    """Make the routes of ``target`` those of ``source``; owners and positions are not."""
+    for v in range(len(source.tours)):
+        size = source.tours[v].size
+        target.tours[v].size = size
+        target.routes[v, : size + 2] = source.routes[v, : size + 2]
 
 
 @njit(cache=True, nogil=True)
@@ -1066,14 +1083,23 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
     :param progress_after: Which part will lie behind after these
     :param settings: :class:`AnnealingSettings`
     """
-    scale = 0.0
+    scale, mean = 0.0, 0.0
     for task in range(1, plan.state[0].n_tasks + 1):
         scale += min(plan.nodes[task].value, plan.state[0].ordinary)
+        mean += plan.nodes[task].value
     scale /= plan.state[0].n_tasks
-    value, length = total_value(plan), total_length(plan)
-    beyond = extraordinary_value(plan)
     measure_all(best)
     best_value, best_length = total_value(best), total_length(best)
+    # The temperature is one for ordinary tasks in the end. Before, it is one for the others too while some of them are missing.
+    ratio = 1.0
+    if extraordinary_value(best, False) > 0.0:
+        ratio = mean / plan.state[0].n_tasks / scale
+    elif extraordinary_value(plan, False) > 0.0:
+        copy_routes(best, plan)
+        measure_all(plan)
+    value, length, limit = total_value(plan), total_length(plan), 0.0
+    # What is dear beyond measure does not make length dear.
+    beyond = extraordinary_value(plan, True)
     for trial in range(n_trials):
         plan.state[0].clock += 1
         n_removed, n_touched = ruin_around(plan, settings.mean_removed, settings.longest_string)
@@ -1082,11 +1108,21 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
                 # This is where we begin, or a trial has overlooked all that it had taken out.
                 fill_everywhere(plan)
                 value, length = total_value(plan), total_length(plan)
-                beyond = extraordinary_value(plan)
+                beyond = extraordinary_value(plan, True)
             continue
+        closed = -1
+        if not plan.state[0].equal and uniform(plan) < CLOSED:
+            # Else a task always goes where it adds least, and never makes way for one that only this UAV can serve.
+            closed = int(uniform(plan) * len(plan.tours))
+            limit = plan.tours[closed].limit
+            plan.tours[closed].limit = -1.0
         n_touched, gain, change = recreate(plan, n_removed, n_touched, settings.n_near, settings.blink, settings.noise)
+        if closed >= 0:
+            plan.tours[closed].limit = limit
         progress = progress_before + (progress_after - progress_before) * (trial / n_trials)
         temperature = scale * settings.hot * (settings.cold / settings.hot) ** progress
+        if ratio > 1.0:
+            temperature *= ratio ** (1.0 - progress)
         score = gain - settings.thrift * (value - beyond) / max(length, EPSILON) * change
         if score < 0.0 and uniform(plan) >= math.exp(score / temperature):
             put_back(plan, n_touched)
@@ -1094,10 +1130,7 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
         value += gain
         length += change
         if abs(gain) > plan.state[0].ordinary:
-            beyond = extraordinary_value(plan)
+            beyond = extraordinary_value(plan, True)
         if value > best_value + SAME_VALUE or (value > best_value - SAME_VALUE and length < best_length - EPSILON):
             best_value, best_length = value, length
-            for v in range(len(plan.tours)):
-                size = plan.tours[v].size
-                best.tours[v].size = size
-                best.routes[v, : size + 2] = plan.routes[v, : size + 2]
+            copy_routes(plan, best)

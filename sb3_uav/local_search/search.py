@@ -104,7 +104,7 @@ class LocalSearch:
         # Useless UAVs cost memory.
         n_uavs = max(self.instance.useful_fleet, len(schedule.routes))
         state = np.zeros(1, kernels.STATE)
-        state["n_tasks"], state["ordinary"] = n_tasks, self._ordinary
+        state["n_tasks"], state["equal"], state["ordinary"] = n_tasks, self.instance.has_equal_uavs, self._ordinary
         # The state of the generator must not be 0.
         state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
@@ -179,7 +179,7 @@ class LocalSearch:
         best = self._load(schedule)
         # Annealing does not find a dear task that costs a whole tour; it has to begin with it.
         for each in (plan, best):
-            kernels.admit_dear(each, _N_NEAR_INSERTED)
+            kernels.admit(each, _N_NEAR_INSERTED)
         if len(self._tasks) > 0:
             if seconds is None:
                 n_trials = _TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
