@@ -40,8 +40,8 @@ CLOSED = 0.2
 
 # What is known of a node: where it is, what it is worth, and what serving it costs; by whom it is visited, -1 if by none, and
 # as which stop; whether it waits in the queue (set for terminals, which never get there); and, as a candidate for insertion,
-# the trial that saw it last, the factor on its worth (below 0 to leave it out), what its cheapest insertion adds to which
-# tour, and after which node.
+# the trial that saw it last, the factor on its worth (below 0 to leave it out), which length of legs its cheapest insertion
+# adds to which tour, and after which node.
 NODE = np.dtype(
     [
         ("x", np.float64),
@@ -582,14 +582,13 @@ def shorten(plan, n_queued, n_near):
 @njit(cache=True, nogil=True, forceinline=True)
 def offer(plan, task, v, a, b):
     """Note that ``task`` fits between ``a`` and ``b`` of tour ``v``, if it does so cheaper than anywhere before."""
-    added = distance(plan, a, task) + distance(plan, task, b) - distance(plan, a, b)
-    offer_at(plan, task, v, a, added + plan.nodes[task].service)
+    offer_at(plan, task, v, a, distance(plan, a, task) + distance(plan, task, b) - distance(plan, a, b))
 
 
 @njit(cache=True, nogil=True, forceinline=True)
 def offer_at(plan, task, v, a, added):
-    """The same, when the added length is already known."""
-    if added < plan.nodes[task].cost and plan.tours[v].length + added <= plan.tours[v].limit:
+    """The same, when the added length of legs is already known."""
+    if added < plan.nodes[task].cost and plan.tours[v].length + (added + plan.nodes[task].service) <= plan.tours[v].limit:
         plan.nodes[task].cost = added
         plan.nodes[task].tour = v
         plan.nodes[task].after = a
@@ -692,9 +691,11 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         while i < n_candidates:
             task = plan.lists[CANDIDATES, i]
             v = plan.nodes[task].tour
-            if v >= 0 and plan.tours[v].length + plan.nodes[task].cost > plan.tours[v].limit:
+            cost = plan.nodes[task].cost + plan.nodes[task].service
+            if v >= 0 and plan.tours[v].length + cost > plan.tours[v].limit:
                 look_around(plan, task, n_near)
                 v = plan.nodes[task].tour
+                cost = plan.nodes[task].cost + plan.nodes[task].service
             if v < 0 and n_near > 0:
                 # It comes back when a leg beside it appears.
                 n_candidates -= 1
@@ -704,7 +705,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
             if v < 0:
                 i += 1
                 continue
-            worth = plan.nodes[task].noise * plan.nodes[task].value / max(plan.nodes[task].cost, EPSILON)
+            worth = plan.nodes[task].noise * plan.nodes[task].value / max(cost, EPSILON)
             if worth > best_worth:
                 best, best_worth = i, worth
             i += 1
@@ -717,7 +718,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         n_touched = keep(plan, n_touched, v)
         place = plan.nodes[a].position + 1 if a != plan.routes[v, 0] else 1
         b = plan.routes[v, place]
-        insert(plan, v, place, task, plan.nodes[task].cost)
+        insert(plan, v, place, task, plan.nodes[task].cost + plan.nodes[task].service)
         for i in range(n_candidates):
             other = plan.lists[CANDIDATES, i]
             if plan.nodes[other].tour == v and plan.nodes[other].after == a:
@@ -857,9 +858,8 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
         route = plan.routes[v]
         leg_before = 0.0
         last = plan.tours[v].size + 1
-        # What is near the end of a tour is near its start, unless they are different.
-        for p in range(last + (route[last] != route[0])):
-            node, behind = route[p], route[min(p + 1, last)]
+        for p in range(last):
+            node, behind = route[p], route[p + 1]
             before = route[p - 1] if p > 0 else route[0]
             leg_behind = distance(plan, node, behind)
             for j in range(n_near):
@@ -868,12 +868,18 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
                     continue
                 n_candidates = enter(plan, n_candidates, task, blink, spread)
                 if plan.nodes[task].noise > 0.0:
-                    reach, service = distance(plan, node, task), plan.nodes[task].service
-                    if p < last:
-                        offer_at(plan, task, v, node, reach + distance(plan, task, behind) - leg_behind + service)
+                    reach = distance(plan, node, task)
+                    offer_at(plan, task, v, node, reach + distance(plan, task, behind) - leg_behind)
                     if p > 0:
-                        offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before + service)
+                        offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before)
             leg_before = leg_behind
+        # What is near the end of a tour is near its start, unless they are different.
+        for j in range(n_near if route[last] != route[0] else 0):
+            task = np.int64(plan.near[route[last], j])
+            if plan.nodes[task].owner < 0:
+                n_candidates = enter(plan, n_candidates, task, blink, spread)
+                if plan.nodes[task].noise > 0.0:
+                    offer(plan, task, v, route[last - 1], route[last])
     n_touched = fill(plan, n_candidates, n_touched, n_near, blink, spread)
     value, length = 0.0, 0.0
     for i in range(n_touched):
