@@ -518,6 +518,28 @@ def try_crossing(plan, n_queued, a, b, distance_ab):
 
 
 @njit(cache=True, nogil=True)
+def try_terminals(plan, n_queued, a, v, longest, saved):
+    """
+    Join ``a`` to the start or to the end of its own tour ``v``; returns as :func:`try_segments`.
+
+    :param longest: How long the new leg may be
+    :param saved: See :func:`survey_segments`
+    """
+    last = plan.tours[v].size + 1
+    to_start, to_end = distance(plan, a, plan.routes[v, 0]), distance(plan, a, plan.routes[v, last])
+    n = -1
+    if to_start < longest:
+        n = try_two_opt(plan, n_queued, a, 0, to_start, True, False)
+    if n < 0 and to_end < longest:
+        n = try_two_opt(plan, n_queued, a, last, to_end, False, True)
+    if n < 0 and to_start < longest:
+        n = try_segments(plan, n_queued, a, v, 0, to_start, saved)
+    if n < 0 and to_end < longest:
+        n = try_segments(plan, n_queued, a, v, last, to_end, saved)
+    return n
+
+
+@njit(cache=True, nogil=True)
 def shorten(plan, n_queued, n_near):
     """
     Make tours shorter around the tasks in the queue until nothing changes there.
@@ -538,17 +560,7 @@ def shorten(plan, n_queued, n_near):
             v, p = np.int64(plan.nodes[a].owner), plan.nodes[a].position
             longest = max(distance(plan, plan.routes[v, p - 1], a), distance(plan, a, plan.routes[v, p + 1]))
             longest = max(longest, survey_segments(plan, a, saved))
-            last = plan.tours[v].size + 1
-            to_start, to_end = distance(plan, a, plan.routes[v, 0]), distance(plan, a, plan.routes[v, last])
-            n = -1
-            if to_start < longest:
-                n = try_two_opt(plan, n_queued, a, 0, to_start, True, False)
-            if n < 0 and to_end < longest:
-                n = try_two_opt(plan, n_queued, a, last, to_end, False, True)
-            if n < 0 and to_start < longest:
-                n = try_segments(plan, n_queued, a, v, 0, to_start, saved)
-            if n < 0 and to_end < longest:
-                n = try_segments(plan, n_queued, a, v, last, to_end, saved)
+            n = try_terminals(plan, n_queued, a, v, longest, saved)
             if n >= 0:
                 n_queued = n
                 improved = changed = True
@@ -834,6 +846,35 @@ def ruin(plan, n_removed, v, first, count):
     return n_removed
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def account(plan, n_touched):
+    """Measure the copied tours; returns by how much value and length of all tours have grown since the trial began."""
+    value, length = 0.0, 0.0
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        measure(plan, v)
+        length += plan.tours[v].length - plan.tours[v].old_length
+        for p in range(1, plan.tours[v].size + 1):
+            value += plan.nodes[plan.routes[v, p]].value
+        for p in range(1, plan.tours[v].old_size + 1):
+            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    return value, length
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def keep_empty(plan, n_touched):
+    """
+    Where UAVs differ, copy the empty tours, so that they are filled as well: no string is ever taken out of them.
+
+    :return: The number of copied tours
+    """
+    if not plan.state[0].equal:
+        for v in range(len(plan.tours)):
+            if plan.tours[v].size == 0 and plan.tours[v].length <= plan.tours[v].limit:
+                n_touched = keep(plan, n_touched, v)
+    return n_touched
+
+
 @njit(cache=True, nogil=True)
 def recreate(plan, n_removed, n_touched, n_near, blink, spread):
     """
@@ -848,11 +889,7 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
         n_candidates = enter(plan, n_candidates, task, blink, spread)
         if plan.nodes[task].noise > 0.0:
             look_around(plan, task, n_near)
-    if not plan.state[0].equal:
-        # No string is ever taken out of an empty tour, so this is the only way to fill it with tasks that wait.
-        for v in range(len(plan.tours)):
-            if plan.tours[v].size == 0 and plan.tours[v].length <= plan.tours[v].limit:
-                n_touched = keep(plan, n_touched, v)
+    n_touched = keep_empty(plan, n_touched)
     for i in range(n_touched):
         v = plan.lists[TOUCHED, i]
         route = plan.routes[v]
@@ -881,15 +918,7 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
                 if plan.nodes[task].noise > 0.0:
                     offer(plan, task, v, route[last - 1], route[last])
     n_touched = fill(plan, n_candidates, n_touched, n_near, blink, spread)
-    value, length = 0.0, 0.0
-    for i in range(n_touched):
-        v = plan.lists[TOUCHED, i]
-        measure(plan, v)
-        length += plan.tours[v].length - plan.tours[v].old_length
-        for p in range(1, plan.tours[v].size + 1):
-            value += plan.nodes[plan.routes[v, p]].value
-        for p in range(1, plan.tours[v].old_size + 1):
-            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    value, length = account(plan, n_touched)
     return n_touched, value, length
 
 
@@ -1096,7 +1125,7 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
     scale /= plan.state[0].n_tasks
     measure_all(best)
     best_value, best_length = total_value(best), total_length(best)
-    # The temperature is one for ordinary tasks in the end. Before, it is one for the others too while some of them are missing.
+    # In the end the temperature is one for ordinary tasks; while others are missing, it starts with one for them too.
     ratio = 1.0
     if extraordinary_value(best, False) > 0.0:
         ratio = mean / plan.state[0].n_tasks / scale

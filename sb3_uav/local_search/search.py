@@ -217,7 +217,7 @@ def warm_up() -> None:
     """
     instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
-    search.repair(search.improve(Schedule([])))
+    search.repair(search.improve(search.insertion()))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
@@ -226,8 +226,10 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
 
     Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
     wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, takes short strings of tasks
-    out to fill the gap better, and empties a tour, or a part of it, for a task that is worth more. Deterministic, and a second repair changes nothing. Differences between values below
-    1e-10 of the greatest do not count, but the result is never worse for them.
+    out to fill the gap better, and empties a tour, or a part of it, for a task that is worth more: of all tasks in reach the
+    one that is worth more than the others together is never missed. Deterministic, and a second repair changes nothing.
+    Differences between values below 1e-10 of the greatest do not count, but the result is never worse for them. With tasks
+    that must be served, values are :attr:`~sb3_uav.envs.instances.Instances.prizes`.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it
