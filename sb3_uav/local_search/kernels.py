@@ -34,12 +34,14 @@ NOWHERE = 1e300
 MAX_SEGMENT = 3
 # A task is dear to a tour if it is worth more than so many average tasks of it: less is won by taking short strings out.
 DEAR = 3
+# Probability that no task may be inserted into one of the tours, where UAVs differ.
+CLOSED = 0.2
 
 
 # What is known of a node: where it is, what it is worth, and what serving it costs; by whom it is visited, -1 if by none, and
 # as which stop; whether it waits in the queue (set for terminals, which never get there); and, as a candidate for insertion,
-# the trial that saw it last, the factor on its worth (below 0 to leave it out), what its cheapest insertion adds to which
-# tour, and after which node.
+# the trial that saw it last, the factor on its worth (below 0 to leave it out), which length of legs its cheapest insertion
+# adds to which tour, and after which node.
 NODE = np.dtype(
     [
         ("x", np.float64),
@@ -69,10 +71,10 @@ TOUR = np.dtype(
     ],
     align=True,
 )
-# The number of tasks, the largest value that is not out of the ordinary, the number of trials so far, and the state of the
-# random numbers.
+# The number of tasks, whether all tours have the same terminals and limits, the largest value that is not out of the
+# ordinary, the number of trials so far, and the state of the random numbers.
 STATE = np.dtype(
-    [("n_tasks", np.int64), ("ordinary", np.float64), ("clock", np.int64), ("random", np.uint64)],
+    [("n_tasks", np.int64), ("equal", np.int64), ("ordinary", np.float64), ("clock", np.int64), ("random", np.uint64)],
     align=True,
 )
 # Rows of Plan.lists.
@@ -516,6 +518,28 @@ def try_crossing(plan, n_queued, a, b, distance_ab):
 
 
 @njit(cache=True, nogil=True)
+def try_terminals(plan, n_queued, a, v, longest, saved):
+    """
+    Join ``a`` to the start or to the end of its own tour ``v``; returns as :func:`try_segments`.
+
+    :param longest: How long the new leg may be
+    :param saved: See :func:`survey_segments`
+    """
+    last = plan.tours[v].size + 1
+    to_start, to_end = distance(plan, a, plan.routes[v, 0]), distance(plan, a, plan.routes[v, last])
+    n = -1
+    if to_start < longest:
+        n = try_two_opt(plan, n_queued, a, 0, to_start, True, False)
+    if n < 0 and to_end < longest:
+        n = try_two_opt(plan, n_queued, a, last, to_end, False, True)
+    if n < 0 and to_start < longest:
+        n = try_segments(plan, n_queued, a, v, 0, to_start, saved)
+    if n < 0 and to_end < longest:
+        n = try_segments(plan, n_queued, a, v, last, to_end, saved)
+    return n
+
+
+@njit(cache=True, nogil=True)
 def shorten(plan, n_queued, n_near):
     """
     Make tours shorter around the tasks in the queue until nothing changes there.
@@ -536,17 +560,7 @@ def shorten(plan, n_queued, n_near):
             v, p = np.int64(plan.nodes[a].owner), plan.nodes[a].position
             longest = max(distance(plan, plan.routes[v, p - 1], a), distance(plan, a, plan.routes[v, p + 1]))
             longest = max(longest, survey_segments(plan, a, saved))
-            last = plan.tours[v].size + 1
-            to_start, to_end = distance(plan, a, plan.routes[v, 0]), distance(plan, a, plan.routes[v, last])
-            n = -1
-            if to_start < longest:
-                n = try_two_opt(plan, n_queued, a, 0, to_start, True, False)
-            if n < 0 and to_end < longest:
-                n = try_two_opt(plan, n_queued, a, last, to_end, False, True)
-            if n < 0 and to_start < longest:
-                n = try_segments(plan, n_queued, a, v, 0, to_start, saved)
-            if n < 0 and to_end < longest:
-                n = try_segments(plan, n_queued, a, v, last, to_end, saved)
+            n = try_terminals(plan, n_queued, a, v, longest, saved)
             if n >= 0:
                 n_queued = n
                 improved = changed = True
@@ -580,14 +594,13 @@ def shorten(plan, n_queued, n_near):
 @njit(cache=True, nogil=True, forceinline=True)
 def offer(plan, task, v, a, b):
     """Note that ``task`` fits between ``a`` and ``b`` of tour ``v``, if it does so cheaper than anywhere before."""
-    added = distance(plan, a, task) + distance(plan, task, b) - distance(plan, a, b)
-    offer_at(plan, task, v, a, added + plan.nodes[task].service)
+    offer_at(plan, task, v, a, distance(plan, a, task) + distance(plan, task, b) - distance(plan, a, b))
 
 
 @njit(cache=True, nogil=True, forceinline=True)
 def offer_at(plan, task, v, a, added):
-    """The same, when the added length is already known."""
-    if added < plan.nodes[task].cost and plan.tours[v].length + added <= plan.tours[v].limit:
+    """The same, when the added length of legs is already known."""
+    if added < plan.nodes[task].cost and plan.tours[v].length + (added + plan.nodes[task].service) <= plan.tours[v].limit:
         plan.nodes[task].cost = added
         plan.nodes[task].tour = v
         plan.nodes[task].after = a
@@ -690,9 +703,11 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         while i < n_candidates:
             task = plan.lists[CANDIDATES, i]
             v = plan.nodes[task].tour
-            if v >= 0 and plan.tours[v].length + plan.nodes[task].cost > plan.tours[v].limit:
+            cost = plan.nodes[task].cost + plan.nodes[task].service
+            if v >= 0 and plan.tours[v].length + cost > plan.tours[v].limit:
                 look_around(plan, task, n_near)
                 v = plan.nodes[task].tour
+                cost = plan.nodes[task].cost + plan.nodes[task].service
             if v < 0 and n_near > 0:
                 # It comes back when a leg beside it appears.
                 n_candidates -= 1
@@ -702,7 +717,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
             if v < 0:
                 i += 1
                 continue
-            worth = plan.nodes[task].noise * plan.nodes[task].value / max(plan.nodes[task].cost, EPSILON)
+            worth = plan.nodes[task].noise * plan.nodes[task].value / max(cost, EPSILON)
             if worth > best_worth:
                 best, best_worth = i, worth
             i += 1
@@ -715,7 +730,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         n_touched = keep(plan, n_touched, v)
         place = plan.nodes[a].position + 1 if a != plan.routes[v, 0] else 1
         b = plan.routes[v, place]
-        insert(plan, v, place, task, plan.nodes[task].cost)
+        insert(plan, v, place, task, plan.nodes[task].cost + plan.nodes[task].service)
         for i in range(n_candidates):
             other = plan.lists[CANDIDATES, i]
             if plan.nodes[other].tour == v and plan.nodes[other].after == a:
@@ -831,6 +846,35 @@ def ruin(plan, n_removed, v, first, count):
     return n_removed
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def account(plan, n_touched):
+    """Measure the copied tours; returns by how much value and length of all tours have grown since the trial began."""
+    value, length = 0.0, 0.0
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        measure(plan, v)
+        length += plan.tours[v].length - plan.tours[v].old_length
+        for p in range(1, plan.tours[v].size + 1):
+            value += plan.nodes[plan.routes[v, p]].value
+        for p in range(1, plan.tours[v].old_size + 1):
+            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    return value, length
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def keep_empty(plan, n_touched):
+    """
+    Where UAVs differ, copy the empty tours, so that they are filled as well: no string is ever taken out of them.
+
+    :return: The number of copied tours
+    """
+    if not plan.state[0].equal:
+        for v in range(len(plan.tours)):
+            if plan.tours[v].size == 0 and plan.tours[v].length <= plan.tours[v].limit:
+                n_touched = keep(plan, n_touched, v)
+    return n_touched
+
+
 @njit(cache=True, nogil=True)
 def recreate(plan, n_removed, n_touched, n_near, blink, spread):
     """
@@ -845,14 +889,14 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
         n_candidates = enter(plan, n_candidates, task, blink, spread)
         if plan.nodes[task].noise > 0.0:
             look_around(plan, task, n_near)
+    n_touched = keep_empty(plan, n_touched)
     for i in range(n_touched):
         v = plan.lists[TOUCHED, i]
         route = plan.routes[v]
         leg_before = 0.0
         last = plan.tours[v].size + 1
-        # What is near the end of a tour is near its start, unless they are different.
-        for p in range(last + (route[last] != route[0])):
-            node, behind = route[p], route[min(p + 1, last)]
+        for p in range(last):
+            node, behind = route[p], route[p + 1]
             before = route[p - 1] if p > 0 else route[0]
             leg_behind = distance(plan, node, behind)
             for j in range(n_near):
@@ -861,22 +905,20 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
                     continue
                 n_candidates = enter(plan, n_candidates, task, blink, spread)
                 if plan.nodes[task].noise > 0.0:
-                    reach, service = distance(plan, node, task), plan.nodes[task].service
-                    if p < last:
-                        offer_at(plan, task, v, node, reach + distance(plan, task, behind) - leg_behind + service)
+                    reach = distance(plan, node, task)
+                    offer_at(plan, task, v, node, reach + distance(plan, task, behind) - leg_behind)
                     if p > 0:
-                        offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before + service)
+                        offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before)
             leg_before = leg_behind
+        # What is near the end of a tour is near its start, unless they are different.
+        for j in range(n_near if route[last] != route[0] else 0):
+            task = np.int64(plan.near[route[last], j])
+            if plan.nodes[task].owner < 0:
+                n_candidates = enter(plan, n_candidates, task, blink, spread)
+                if plan.nodes[task].noise > 0.0:
+                    offer(plan, task, v, route[last - 1], route[last])
     n_touched = fill(plan, n_candidates, n_touched, n_near, blink, spread)
-    value, length = 0.0, 0.0
-    for i in range(n_touched):
-        v = plan.lists[TOUCHED, i]
-        measure(plan, v)
-        length += plan.tours[v].length - plan.tours[v].old_length
-        for p in range(1, plan.tours[v].size + 1):
-            value += plan.nodes[plan.routes[v, p]].value
-        for p in range(1, plan.tours[v].old_size + 1):
-            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    value, length = account(plan, n_touched)
     return n_touched, value, length
 
 
@@ -939,12 +981,14 @@ def make_room(plan, task, v, keep_rest):
 
 
 @njit(cache=True, nogil=True)
-def admit_dear(plan, n_near):
+def admit(plan, n_near):
     """
-    Empty tours, or a part of them, for unvisited tasks that are dear to them, and fill them again, wherever that is worth more.
+    Make room for unvisited tasks and insert what had to leave elsewhere, wherever that is worth more; returns how often.
+
+    For a task that is dear to a tour all of it may leave. Where UAVs are equal, only such tasks are tried: the others come in
+    where strings are taken out.
 
     :param n_near: Beside how many neighbors a task may be inserted
-    :return: How often
     """
     count = 0
     for task in range(1, plan.state[0].n_tasks + 1):
@@ -955,12 +999,13 @@ def admit_dear(plan, n_near):
             value = 0.0
             for p in range(1, size + 1):
                 value += plan.nodes[plan.routes[v, p]].value
-            if plan.nodes[task].value * size <= value * min(size, DEAR):
-                continue
+            is_dear = plan.nodes[task].value * size > value * min(size, DEAR)
             alone = distance(plan, plan.routes[v, 0], task) + distance(plan, task, plan.routes[v, size + 1])
-            if alone + plan.nodes[task].service > plan.tours[v].limit:
+            if alone + plan.nodes[task].service > plan.tours[v].limit or (plan.state[0].equal and not is_dear):
                 continue
             for keep_rest in (True, False):
+                if not keep_rest and not is_dear:
+                    break
                 plan.state[0].clock += 1
                 n_touched = keep(plan, 0, v)
                 n_removed = make_room(plan, task, v, keep_rest)
@@ -971,8 +1016,6 @@ def admit_dear(plan, n_near):
                     count += 1
                     break
                 put_back(plan, n_touched)
-                if n_removed < 0:
-                    break
     return count
 
 
@@ -999,7 +1042,7 @@ def descend(plan, n_near_joined, n_near_inserted, max_string):
         return True
     if changed or max_string == 0:
         return changed
-    return eject(plan, n_near_inserted, max_string) > 0 or admit_dear(plan, n_near_inserted) > 0
+    return eject(plan, n_near_inserted, max_string) > 0 or admit(plan, n_near_inserted) > 0
 
 
 @njit(cache=True, nogil=True)
@@ -1046,13 +1089,22 @@ def ruin_around(plan, mean_removed, longest):
 
 
 @njit(cache=True, nogil=True)
-def extraordinary_value(plan):
-    """What the visited tasks are worth beyond the ordinary: it does not count for how dear length is."""
+def extraordinary_value(plan, visited):
+    """What visited or unvisited tasks are worth beyond the ordinary."""
     total = 0.0
     for task in range(1, plan.state[0].n_tasks + 1):
-        if plan.nodes[task].owner >= 0:
+        if (plan.nodes[task].owner >= 0) == visited:
             total += max(plan.nodes[task].value - plan.state[0].ordinary, 0.0)
     return total
+
+
+@njit(cache=True, nogil=True)
+def copy_routes(source, target):
+    """Make the routes of ``target`` those of ``source``; owners and positions are not."""
+    for v in range(len(source.tours)):
+        size = source.tours[v].size
+        target.tours[v].size = size
+        target.routes[v, : size + 2] = source.routes[v, : size + 2]
 
 
 @njit(cache=True, nogil=True)
@@ -1066,14 +1118,23 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
     :param progress_after: Which part will lie behind after these
     :param settings: :class:`AnnealingSettings`
     """
-    scale = 0.0
+    scale, mean = 0.0, 0.0
     for task in range(1, plan.state[0].n_tasks + 1):
         scale += min(plan.nodes[task].value, plan.state[0].ordinary)
+        mean += plan.nodes[task].value
     scale /= plan.state[0].n_tasks
-    value, length = total_value(plan), total_length(plan)
-    beyond = extraordinary_value(plan)
     measure_all(best)
     best_value, best_length = total_value(best), total_length(best)
+    # In the end the temperature is one for ordinary tasks; while others are missing, it starts with one for them too.
+    ratio = 1.0
+    if extraordinary_value(best, False) > 0.0:
+        ratio = mean / plan.state[0].n_tasks / scale
+    elif extraordinary_value(plan, False) > 0.0:
+        copy_routes(best, plan)
+        measure_all(plan)
+    value, length, limit = total_value(plan), total_length(plan), 0.0
+    # What is dear beyond measure does not make length dear.
+    beyond = extraordinary_value(plan, True)
     for trial in range(n_trials):
         plan.state[0].clock += 1
         n_removed, n_touched = ruin_around(plan, settings.mean_removed, settings.longest_string)
@@ -1082,11 +1143,21 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
                 # This is where we begin, or a trial has overlooked all that it had taken out.
                 fill_everywhere(plan)
                 value, length = total_value(plan), total_length(plan)
-                beyond = extraordinary_value(plan)
+                beyond = extraordinary_value(plan, True)
             continue
+        closed = -1
+        if not plan.state[0].equal and uniform(plan) < CLOSED:
+            # Else a task always goes where it adds least, and never makes way for one that only this UAV can serve.
+            closed = int(uniform(plan) * len(plan.tours))
+            limit = plan.tours[closed].limit
+            plan.tours[closed].limit = -1.0
         n_touched, gain, change = recreate(plan, n_removed, n_touched, settings.n_near, settings.blink, settings.noise)
+        if closed >= 0:
+            plan.tours[closed].limit = limit
         progress = progress_before + (progress_after - progress_before) * (trial / n_trials)
         temperature = scale * settings.hot * (settings.cold / settings.hot) ** progress
+        if ratio > 1.0:
+            temperature *= ratio ** (1.0 - progress)
         score = gain - settings.thrift * (value - beyond) / max(length, EPSILON) * change
         if score < 0.0 and uniform(plan) >= math.exp(score / temperature):
             put_back(plan, n_touched)
@@ -1094,10 +1165,7 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
         value += gain
         length += change
         if abs(gain) > plan.state[0].ordinary:
-            beyond = extraordinary_value(plan)
+            beyond = extraordinary_value(plan, True)
         if value > best_value + SAME_VALUE or (value > best_value - SAME_VALUE and length < best_length - EPSILON):
             best_value, best_length = value, length
-            for v in range(len(plan.tours)):
-                size = plan.tours[v].size
-                best.tours[v].size = size
-                best.routes[v, : size + 2] = plan.routes[v, : size + 2]
+            copy_routes(plan, best)

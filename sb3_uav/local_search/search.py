@@ -88,9 +88,7 @@ class LocalSearch:
         self._node_of_task = np.zeros(instance.n_tasks, np.int64)
         self._node_of_task[self._tasks] = np.arange(1, n_tasks + 1)
         largest = max(abs(self._nodes["x"]).max(), abs(self._nodes["y"]).max(), 1.0)
-        self._limits = np.minimum(
-            limits * (1.0 + USABLE_TOLERANCE), limits * (1.0 + DISTANCE_TOLERANCE) - _ROUNDING * largest
-        )
+        self._limits = np.minimum(limits * (1.0 + USABLE_TOLERANCE), limits * (1.0 + DISTANCE_TOLERANCE) - _ROUNDING * largest)
         self._near = np.zeros((len(self._nodes), max(min(_N_NEAR, n_tasks - 1), 0)), np.int32)
         kernels.find_near(self._nodes, n_tasks, self._near)
 
@@ -104,7 +102,7 @@ class LocalSearch:
         # Useless UAVs cost memory.
         n_uavs = max(self.instance.useful_fleet, len(schedule.routes))
         state = np.zeros(1, kernels.STATE)
-        state["n_tasks"], state["ordinary"] = n_tasks, self._ordinary
+        state["n_tasks"], state["equal"], state["ordinary"] = n_tasks, self.instance.has_equal_uavs, self._ordinary
         # The state of the generator must not be 0.
         state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
@@ -179,7 +177,7 @@ class LocalSearch:
         best = self._load(schedule)
         # Annealing does not find a dear task that costs a whole tour; it has to begin with it.
         for each in (plan, best):
-            kernels.admit_dear(each, _N_NEAR_INSERTED)
+            kernels.admit(each, _N_NEAR_INSERTED)
         if len(self._tasks) > 0:
             if seconds is None:
                 n_trials = _TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
@@ -219,7 +217,7 @@ def warm_up() -> None:
     """
     instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
-    search.repair(search.improve(Schedule([])))
+    search.repair(search.improve(search.insertion()))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
@@ -227,9 +225,11 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
     Local search until nothing changes.
 
     Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
-    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of
-    tasks out to fill the gap better. Deterministic, and a second repair changes nothing. Differences between values below
-    1e-10 of the greatest do not count, but the result is never worse for them.
+    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, takes short strings of tasks
+    out to fill the gap better, and empties a tour, or a part of it, for a task that is worth more: of all tasks in reach the
+    one that is worth more than the others together is never missed. Deterministic, and a second repair changes nothing.
+    Differences between values below 1e-10 of the greatest do not count, but the result is never worse for them. With tasks
+    that must be served, values are :attr:`~sb3_uav.envs.instances.Instances.prizes`.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it
@@ -240,6 +240,21 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
     :raises ValueError: If there is not exactly one instance
     """
     return LocalSearch(instance).repair(schedule, seconds, max_string)
+
+
+def repaired_insertion(instance: Instances, seconds: float | None = None) -> Schedule:
+    """
+    Cheapest insertion, then local search until nothing changes: a good schedule in a few milliseconds, whatever the instance.
+
+    :param instance: A batch of one, possibly padded
+    :param seconds: When to stop, but not before the insertion has ended; None for never
+    :return: A feasible schedule
+    :raises ValueError: If there is not exactly one instance
+    """
+    start = time.perf_counter()
+    search = LocalSearch(instance)
+    inserted = search.insertion()
+    return search.repair(inserted, None if seconds is None else start + seconds - time.perf_counter())
 
 
 def repair_best(instance: Instances, schedules: Iterable[Schedule], seconds: float | None = None) -> Schedule:
