@@ -307,7 +307,7 @@ class ReducedInstance:
         smallest_prize = self.n_uavs * RESOLUTION + 1
         greatest = max(1, largest_sum // (self.n_tasks * smallest_prize))
         finest = min(finest, greatest)
-        reference = self._greatest_ordinary_value()
+        reference = self.values[~self.is_dear].max()
         finer = greatest * (reference / self.values.max())
         if reference == self.values.max() or finer < 1:
             counts = self.values / self.values.max() * finest
@@ -323,9 +323,23 @@ class ReducedInstance:
                 break
         return counts // np.gcd.reduce(counts) * smallest_prize
 
-    def _greatest_ordinary_value(self) -> float:
-        """The greatest value of a task that need not be served, as far as can be seen; of all where all seem alike."""
+    @cached_property
+    def is_dear(self) -> np.ndarray:
+        """
+        Which tasks have to be served, as far as can be seen: those of about the same value that outweigh all others together;
+        none where there are no others. ``(n,)`` bool.
+        """
+        if self.n_tasks < 2:
+            return np.zeros(self.n_tasks, dtype=bool)
         ordered = np.sort(self.values)
         smaller = np.cumsum(ordered)[:-1]
-        outweighs = (ordered[1:] > _OUTWEIGHING * smaller) & (ordered[-1] <= _ALIKE * (1 + _MULTIPLE_TOLERANCE) * ordered[1:])
-        return float(ordered[outweighs.argmax()] if outweighs.any() else ordered[-1])
+        outweighs = ordered[1:] >= _OUTWEIGHING * (1 - _MULTIPLE_TOLERANCE) * smaller
+        outweighs &= ordered[-1] <= _ALIKE * (1 + _MULTIPLE_TOLERANCE) * ordered[1:]
+        return self.values >= (ordered[1:][outweighs.argmax()] if outweighs.any() else np.inf)
+
+    def total_value(self, routes: Iterable[Iterable[int]]) -> float:
+        """
+        :param routes: Routes as nodes
+        :return: The total value of the tasks on them
+        """
+        return math.fsum(self.values[node - self.n_sites] for route in routes for node in route)

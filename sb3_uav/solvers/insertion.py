@@ -17,7 +17,8 @@ _SMALLEST_DETOUR = 1e-12
 class GreedyInsertion(OneByOneSolver):
     """
     Insert the task with the largest value per added length where it adds the least, into any tour that has room for it, until
-    no task fits.
+    no task fits. Where some tasks are worth so much more than others that they seem to have to be served, also these first;
+    the better schedule counts.
     """
 
     name = "greedy-insertion"
@@ -26,13 +27,19 @@ class GreedyInsertion(OneByOneSolver):
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
         reduced = ReducedInstance.of(instance)
-        return Solution(reduced.schedule(insert_greedily(reduced)))
+        routes = insert_greedily(reduced)
+        if reduced.is_dear.any():
+            routes = max(routes, insert_greedily(reduced, dear_first=True), key=reduced.total_value)
+        return Solution(reduced.schedule(routes))
 
 
-def insert_greedily(reduced: ReducedInstance, given: Sequence[Sequence[int]] = ()) -> list[list[int]]:
+def insert_greedily(
+    reduced: ReducedInstance, given: Sequence[Sequence[int]] = (), dear_first: bool = False
+) -> list[list[int]]:
     """
     :param reduced: What to plan
     :param given: Routes of the first UAVs to start from, as nodes; empty ones when there are fewer than useful UAVs
+    :param dear_first: Whether tasks that seem to have to be served come before all others
     :return: One route per useful UAV, as nodes
     """
     routes = [list(route) for route in given] + [[] for _ in range(reduced.n_uavs - len(given))]
@@ -46,11 +53,16 @@ def insert_greedily(reduced: ReducedInstance, given: Sequence[Sequence[int]] = (
     position, detour = np.stack(positions), np.stack(detours)
     free = np.ones(reduced.n_tasks, dtype=bool)
     free[[node - reduced.n_sites for route in routes for node in route]] = False
+    dear_first = dear_first and bool(reduced.is_dear.any())
     while True:
-        rate = np.where(free & (detour <= slack[:, None]), reduced.values / np.maximum(detour, _SMALLEST_DETOUR), 0.0)
+        eligible = free & reduced.is_dear if dear_first else free
+        rate = np.where(eligible & (detour <= slack[:, None]), reduced.values / np.maximum(detour, _SMALLEST_DETOUR), 0.0)
         uav, task = map(int, np.unravel_index(rate.argmax(), rate.shape))
         if rate[uav, task] == 0:
-            return routes
+            if not dear_first:
+                return routes
+            dear_first = False
+            continue
         routes[uav].insert(position[uav, task], task + reduced.n_sites)
         slack[uav] -= detour[uav, task]
         free[task] = False

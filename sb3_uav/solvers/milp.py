@@ -22,6 +22,9 @@ COINCIDENT = 1e-12
 _LENGTH_TOLERANCE = 1e-13
 # In units of what a UAV can fly.
 _TOO_FAR = 2.0
+# Solvers tell objectives apart that differ by a little more than 1e-9. Where values span more than this, or are whole and
+# greater, the objective is this many times as large, so that whole values up to 1e9 keep their order.
+_WIDE_SPAN = 1e6
 
 
 class _Places(NamedTuple):
@@ -123,6 +126,9 @@ class MILP(TimeLimitedSolver):
     the best schedule so far is returned with the proven bound; without one,
     :class:`~sb3_uav.solvers.base.NoScheduleError` is raised, which holds the bound.
 
+    Values are told apart, and the bound is exact, to 1e-9 of the greatest value, and to 1e-15 of it if values are whole and
+    greater than a million, or span more than that: whole values up to 1e9 are exact.
+
     Nothing is added against the symmetry of identical UAVs: that speeds up proofs for ten tasks, but HiGHS then finds no
     schedule at all for eighty.
 
@@ -174,7 +180,7 @@ class MILP(TimeLimitedSolver):
         while len(places.values) > 0 and (remaining := deadline - time.perf_counter()) > 0:
             program = _paper_program(places, forbidden)
             answer = self.backend.solve(program, remaining, self.threads, seed)
-            bound = min(bound, free_value + answer.bound * places.values.max())
+            bound = min(bound, free_value + answer.bound * _value_unit(places.values))
             if answer.columns is None:
                 break
             cycles = _flown_cycles(answer.columns, len(places.values))
@@ -237,7 +243,7 @@ def _paper_program(places: _Places, forbidden: Sequence[_Forbidden] = ()) -> Pro
 
     :param places: At least one place
     :param forbidden: Cycles of places that UAVs may not fly
-    :return: The program; its objective is in units of the largest value
+    :return: The program; its objective is in units of :func:`_value_unit`
     """
     n_places, n_uavs = len(places.values), len(places.uavs)
     start, end = _arcs(n_places)
@@ -288,7 +294,7 @@ def _paper_program(places: _Places, forbidden: Sequence[_Forbidden] = ()) -> Pro
 
     # (1) The value of the visited places.
     objective = np.zeros(n_uavs * width)
-    objective[y] = places.values / places.values.max()
+    objective[y] = places.values / _value_unit(places.values)
     column_upper = np.ones(n_uavs * width)
     column_upper[z] = most_flown.clip(0)
     if not places.has_one_depot:
@@ -299,6 +305,17 @@ def _paper_program(places: _Places, forbidden: Sequence[_Forbidden] = ()) -> Pro
     binary = np.ones(n_uavs * width, dtype=bool)
     binary[z] = False
     return rows.program(objective, column_upper, binary)
+
+
+def _value_unit(values: np.ndarray) -> float:
+    """
+    :param values: ``(n,)``, of the places
+    :return: The unit of the objective: the largest value, or a part of it where small differences must count
+    """
+    largest = float(values.max())
+    is_whole = bool((values == np.rint(values)).all())
+    is_wide = largest > _WIDE_SPAN * values.min() or (is_whole and largest > _WIDE_SPAN)
+    return largest / _WIDE_SPAN if is_wide else largest
 
 
 def _flown_cycles(columns: np.ndarray, n_places: int) -> list[tuple[int, tuple[int, ...]]]:

@@ -20,7 +20,7 @@ def with_feasible_tours(reduced: ReducedInstance, routes: Sequence[Sequence[int]
     fitting = [_shortened(reduced, route, uav) for uav, route in enumerate(routes)]
     if all(len(short) == len(route) for short, route in zip(fitting, routes, strict=True)):
         return fitting
-    return insert_greedily(reduced, fitting)
+    return insert_greedily(reduced, fitting, dear_first=True)
 
 
 def _shortened(reduced: ReducedInstance, route: Sequence[int], uav: int) -> list[int]:
