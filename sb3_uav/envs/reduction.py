@@ -307,9 +307,13 @@ class ReducedInstance:
         smallest_prize = self.n_uavs * RESOLUTION + 1
         greatest = max(1, largest_sum // (self.n_tasks * smallest_prize))
         finest = min(finest, greatest)
-        reference = self.values[~self.is_dear].max()
+        ordinary = self.values[~self.is_dear]
+        # Where a task is worth just twice as much as the others together, nothing says that it is not one of them.
+        just_twice = _OUTWEIGHING * (1 + _MULTIPLE_TOLERANCE) * ordinary.sum()
+        has_dear = len(ordinary) < self.n_tasks and self.values[self.is_dear].min() > just_twice
+        reference = ordinary.max() if has_dear else self.values.max()
         finer = greatest * (reference / self.values.max())
-        if reference == self.values.max() or finer < 1:
+        if not has_dear or finer < 1:
             counts = self.values / self.values.max() * finest
         else:
             counts = self.values / reference * min(finest, finer)
