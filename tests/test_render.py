@@ -224,15 +224,14 @@ def marks(axes: Any) -> dict[tuple[float, float], list[tuple[str, tuple[int, ...
         color = (
             tuple((255 * artist.get_facecolor()[0][:3]).round().astype(int).tolist()) if len(artist.get_facecolor()) else ()
         )
-        outline = str(artist.get_paths()[0].vertices.shape)
+        outline = str(len(artist.get_paths()[0]))
         for place in artist.get_offsets().tolist():
             found.setdefault((place[0], place[1]), []).append((outline, color))
     return found
 
 
 def outline_of(marker: str) -> str:
-    path = MarkerStyle(marker).get_path()
-    return str(path.vertices.shape)
+    return str(len(MarkerStyle(marker).get_path()))
 
 
 def rgb(color: str) -> tuple[int, ...]:
