@@ -12,9 +12,13 @@ def largest_value(instances: Instances, row: int = 0) -> float:
     """
     :param instances: The instances
     :param row: Which of them
-    :return: The largest total value of any feasible schedule, of those that serve the most tasks that must be served
+    :return: The largest sum of prizes of any feasible schedule: its value, if no task must be served
     """
-    return best_score(instances, row)[1]
+    n_must, value = best_score(instances, row)
+    if n_must == 0:
+        return value
+    total = float((instances.values * instances.task_mask)[row].sum())
+    return value + n_must * (2 * total if total > 0 else 1.0)
 
 
 def best_score(instances: Instances, row: int = 0) -> tuple[int, float]:

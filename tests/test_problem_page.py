@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ TABLE = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end of the table -->)", re.
 def solver_class(name: str) -> type[Solver]:
     """The class of a solver, also of one that a function makes."""
     factory = solver_factory(name)
-    found = factory if inspect.isclass(factory) else inspect.signature(factory, eval_str=True).return_annotation
+    found: Any = factory if inspect.isclass(factory) else inspect.signature(factory, eval_str=True).return_annotation
     assert issubclass(found, Solver)
     return found
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import re
 from dataclasses import replace
@@ -334,13 +333,3 @@ def test_equal_uavs_get_clusters_as_before() -> None:
     batch = UniformGenerator(30, 4)(1, np.random.default_rng(0))
     expected = kmeans(batch.tasks[0].numpy(), 4, np.random.default_rng(5), 3)
     assert (clusters_of_uavs(batch, np.random.default_rng(5), 3) == expected).all()
-
-
-def test_signatures_of_factories_name_the_solver() -> None:
-    """The table of the documentation reads them."""
-    from sb3_uav.solvers.registry import solver_factory
-
-    for name in SOLVERS:
-        factory = solver_factory(name)
-        kind = factory if inspect.isclass(factory) else inspect.signature(factory, eval_str=True).return_annotation
-        assert issubclass(kind, Solver)
