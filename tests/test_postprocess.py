@@ -20,10 +20,12 @@ from sb3_uav.common.optional import install_command
 from sb3_uav.envs import Instances, Schedule, UniformGenerator, check_schedule
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.solvers import make_solver
+from sb3_uav.solvers.counting_tasks import CountingTasks
 from sb3_uav.solvers.decoding import Decoder
 from sb3_uav.solvers.postprocess import Refinement, polish
 
 pytest.importorskip("numba")
+search = pytest.importorskip("sb3_uav.local_search.search")
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,48 @@ def test_refined_schedules_of_any_instance_are_feasible_and_not_worse(batch: Ins
     repaired = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, repair=True), batch)
     polished = objectives(make_pair(batch.n_uavs, decode="sampling", samples=4, polish=0.004), batch)
     assert (repaired >= plain).all() and (polished >= plain).all()
+
+
+@settings(max_examples=8)
+@given(instance_batches(max_tasks=12))
+def test_never_worse_than_repaired_insertion(batch: Instances) -> None:
+    """Untrained networks are much worse; where there is no time at all, the insertion itself is still there."""
+    pairs = [make_pair(batch.n_uavs, **options) for options in ({"repair": True}, {"polish": 0.001})]
+    counting = CountingTasks.of(batch).instances
+    repaired = [search.repaired_insertion(counting[row]) for row in range(len(batch))]
+    inserted = [search.repaired_insertion(counting[row], 0.0) for row in range(len(batch))]
+    for pair in pairs:
+        for found, time_limit in ((repaired, None), (inserted, 1e-6)):
+            results = pair.solve(batch, time_limit)
+            for row, result in enumerate(results):
+                least = check_schedule(counting, row, found[row]).objective
+                assert check_schedule(batch, row, result.schedule).objective >= least * (1 - 1e-12)
+
+
+def test_insertion_has_the_whole_time_limit(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the networks run, which may need more than there is; what it finds is repaired and compared."""
+    events: list[Any] = []
+    insertion, blocks = search.repaired_insertion, Decoder.blocks
+
+    def noting(instance: Instances, seconds: float) -> Schedule:
+        events.append(seconds)
+        return insertion(instance)
+
+    def late(*args: Any, **kwargs: Any) -> Any:
+        events.append("networks")
+        clock.now = 200.0
+        return blocks(*args, **kwargs)
+
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(search, "repaired_insertion", noting)
+    monkeypatch.setattr(Decoder, "blocks", late)
+    for module in ("dl_drl", "postprocess"):
+        fake = SimpleNamespace(perf_counter=lambda: clock.now)
+        monkeypatch.setattr(f"sb3_uav.solvers.{module}.time", fake)
+    found = objectives(make_pair(repair=True, time_limit=0.05), instances)
+    assert events == [pytest.approx(0.05)] * 4 + ["networks"]
+    least = [check_schedule(instances, row, insertion(instances[row])).objective for row in range(4)]
+    assert (found >= np.array(least)).all()
 
 
 def test_repair_is_repeatable(instances: Instances) -> None:

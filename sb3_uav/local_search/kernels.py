@@ -4,7 +4,9 @@ The compiled part of local search: plain loops over arrays, without the GIL.
 All of it stands in one file because numba's cache on disk notices changes of a function's own file only. The first call
 after an installation compiles, which takes a while; later processes load the result from ``__pycache__``.
 
-Nodes are numbered from 0, the depot, to ``n_tasks``. A *place* in a tour is the position that a new task would take there.
+Node 0 is the depot, nodes 1 to ``n_tasks`` are the tasks. Then follow the other *terminals*, points where a UAV starts or has
+to arrive; every route holds its own terminals, so that no code depends on which they are. Lengths of tours hold the service
+costs of their tasks. A *place* in a tour is the position that a new task would take there.
 Sums of legs are added up again from scratch whenever a tour has been changed for good, so rounding errors never pile up.
 """
 
@@ -24,22 +26,28 @@ except ImportError as error:
 
 # Changes of a tour's length below this are rounding errors; tours are at most 1 long.
 EPSILON = 1e-12
-# Values of schedules that differ by less count as equal while annealing; task values are at most 1.
-SAME_VALUE = 1e-9
+# Values of schedules that differ by less count as equal while annealing: less than any two sums of task values differ by.
+SAME_VALUE = 0.5**37
 # What no insertion costs.
 NOWHERE = 1e300
 # The longest chain of tasks that moves as one.
 MAX_SEGMENT = 3
+# A task is dear to a tour if it is worth more than so many average tasks of it: less is won by taking short strings out.
+DEAR = 3
+# Probability that no task may be inserted into one of the tours, where UAVs differ.
+CLOSED = 0.2
 
 
-# What is known of a node: where it is and what it is worth; by whom it is visited, -1 if by none, and as which stop; whether
-# it waits in the queue; and, as a candidate for insertion, the trial that saw it last, the factor on its worth (below 0 to
-# leave it out), what its cheapest insertion adds to which tour, and after which node.
+# What is known of a node: where it is, what it is worth, and what serving it costs; by whom it is visited, -1 if by none, and
+# as which stop; whether it waits in the queue (set for terminals, which never get there); and, as a candidate for insertion,
+# the trial that saw it last, the factor on its worth (below 0 to leave it out), which length of legs its cheapest insertion
+# adds to which tour, and after which node.
 NODE = np.dtype(
     [
         ("x", np.float64),
         ("y", np.float64),
         ("value", np.float64),
+        ("service", np.float64),
         ("owner", np.int32),
         ("position", np.int32),
         ("seen", np.int64),
@@ -51,9 +59,10 @@ NODE = np.dtype(
     ],
     align=True,
 )
-# Number of tasks and length of a tour, now and when the current trial changed it first.
+# The longest that a tour may be; its number of tasks and its length, now and when the current trial changed it first.
 TOUR = np.dtype(
     [
+        ("limit", np.float64),
         ("size", np.int64),
         ("length", np.float64),
         ("old_size", np.int64),
@@ -62,8 +71,12 @@ TOUR = np.dtype(
     ],
     align=True,
 )
-# The longest feasible tour, the number of trials so far, and the state of the random numbers.
-STATE = np.dtype([("limit", np.float64), ("clock", np.int64), ("random", np.uint64)], align=True)
+# The number of tasks, whether all tours have the same terminals and limits, the largest value that is not out of the
+# ordinary, the number of trials so far, and the state of the random numbers.
+STATE = np.dtype(
+    [("n_tasks", np.int64), ("equal", np.int64), ("ordinary", np.float64), ("clock", np.int64), ("random", np.uint64)],
+    align=True,
+)
 # Rows of Plan.lists.
 QUEUE, REMOVED, CANDIDATES, TOUCHED = range(4)
 
@@ -98,9 +111,9 @@ class Plan(NamedTuple):
 
     Records, because every array that is passed to a function costs time.
 
-    :param nodes: ``(n_tasks + 1,)`` of :data:`NODE`, the depot first
-    :param near: ``(n_tasks + 1, n_near)`` int32, for every node the nearest tasks, nearest first
-    :param routes: ``(2 * n_uavs, n_tasks + 2)`` int64: of every UAV the depot, its tasks in flying order, the depot; copies
+    :param nodes: ``(n_nodes,)`` of :data:`NODE`: the depot, the tasks, other terminals
+    :param near: ``(n_nodes, n_near)`` int32, for every node the nearest tasks, nearest first
+    :param routes: ``(2 * n_uavs, n_tasks + 2)`` int64: of every UAV its start, its tasks in flying order, its end; copies
     :param tours: ``(n_uavs,)`` of :data:`TOUR`
     :param lists: ``(4, n_tasks + n_uavs + 1)`` int64, lists of nodes or tours
     :param state: ``(1,)`` of :data:`STATE`
@@ -143,14 +156,15 @@ def measure(plan, v):
     for p in range(1, plan.tours[v].size + 1):
         plan.nodes[route[p]].owner = v
         plan.nodes[route[p]].position = p
-        length += distance(plan, route[p - 1], route[p])
-    plan.tours[v].length = length + distance(plan, route[plan.tours[v].size], 0)
+        length += distance(plan, route[p - 1], route[p]) + plan.nodes[route[p]].service
+    size = plan.tours[v].size
+    plan.tours[v].length = length + distance(plan, route[size], route[size + 1])
 
 
 @njit(cache=True, nogil=True)
 def measure_all(plan):
     """Compute from the routes which UAV visits each task, and how long the tours are."""
-    for task in range(len(plan.nodes)):
+    for task in range(1, plan.state[0].n_tasks + 1):
         plan.nodes[task].owner = -1
     for v in range(len(plan.tours)):
         measure(plan, v)
@@ -159,7 +173,7 @@ def measure_all(plan):
 @njit(cache=True, nogil=True)
 def total_value(plan):
     total = 0.0
-    for task in range(1, len(plan.nodes)):
+    for task in range(1, plan.state[0].n_tasks + 1):
         if plan.nodes[task].owner >= 0:
             total += plan.nodes[task].value
     return total
@@ -222,8 +236,8 @@ def reverse(plan, v, first, last):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def push(plan, n_queued, node):
-    """Queue a node unless it is the depot or waits already; returns the new length of the queue."""
-    if node == 0 or plan.nodes[node].queued:
+    """Queue a node unless it is a terminal or waits already; returns the new length of the queue."""
+    if plan.nodes[node].queued:
         return n_queued
     plan.nodes[node].queued = True
     plan.lists[QUEUE, n_queued] = node
@@ -231,18 +245,19 @@ def push(plan, n_queued, node):
 
 
 @njit(cache=True, nogil=True)
-def find_near(nodes, near):
+def find_near(nodes, n_tasks, near):
     """
     Fill in the nearest tasks of every node, nearest first; of several as near, those with the smallest numbers.
 
     :param nodes: As in :class:`Plan`
+    :param n_tasks: Number of tasks
     :param near: As in :class:`Plan`, to be filled
     """
     n_near = near.shape[1]
     squares = np.empty(n_near)
     for a in range(len(nodes)):
         count = 0
-        for b in range(1, len(nodes)):
+        for b in range(1, n_tasks + 1):
             dx, dy = nodes[a].x - nodes[b].x, nodes[a].y - nodes[b].y
             square = dx * dx + dy * dy
             if b == a or (count == n_near and (n_near == 0 or square >= squares[n_near - 1])):
@@ -298,19 +313,19 @@ def survey_segments(plan, a, saved):
 
 
 @njit(cache=True, nogil=True)
-def try_segments(plan, n_queued, a, b, distance_ab, at_start, saved):
+def try_segments(plan, n_queued, a, w, q, distance_ab, saved):
     """
-    Or-opt and relocation: move one to three tasks, ``a`` at one end, next to ``b``, if that makes the tours shorter.
+    Or-opt and relocation: move one to three tasks, ``a`` at one end, next to another stop, if that makes the tours shorter.
 
-    :param b: A visited task, or the depot, which means that of ``a``'s own tour
-    :param at_start: Which depot is meant: that at the start of the tour, or that at its end
+    :param w: A tour
+    :param q: Position in it of the other stop ``b``; it is a terminal only if the tour is ``a``'s own
+    :param distance_ab: Distance between the two
     :param saved: See :func:`survey_segments`
     :return: The new length of the queue, -1 if nothing has changed
     """
     v = plan.nodes[a].owner
-    w = v if b == 0 else plan.nodes[b].owner
+    b = plan.routes[w, q]
     p = plan.nodes[a].position
-    q = plan.nodes[b].position if b > 0 else 0 if at_start else plan.tours[v].size + 1
     for k in range(2 * MAX_SEGMENT):
         if saved[k] <= distance_ab:
             continue
@@ -334,7 +349,9 @@ def try_segments(plan, n_queued, a, b, distance_ab, at_start, saved):
             if w != v:
                 for r in range(first, last):
                     inside += distance(plan, plan.routes[v, r], plan.routes[v, r + 1])
-                if plan.tours[w].length + added + inside > plan.state[0].limit:
+                for r in range(first, last + 1):
+                    inside += plan.nodes[plan.routes[v, r]].service
+                if plan.tours[w].length + added + inside > plan.tours[w].limit:
                     continue
             before, behind = plan.routes[v, first - 1], plan.routes[v, last + 1]
             plan.tours[v].length -= saved[k] + inside
@@ -347,13 +364,23 @@ def try_segments(plan, n_queued, a, b, distance_ab, at_start, saved):
 
 
 @njit(cache=True, nogil=True)
-def try_two_opt(plan, n_queued, a, b, distance_ab):
-    """2-opt within one tour: join ``a`` and ``b``, turn round what lies between. Parameters as of :func:`try_segments`."""
+def try_two_opt(plan, n_queued, a, q, distance_ab, forwards, backwards):
+    """
+    2-opt within one tour: join ``a`` and another stop ``b``, turn round what lies between.
+
+    :param q: Position of ``b``, which may be a terminal
+    :param distance_ab: Distance between the two
+    :param forwards: Whether the legs behind both may vanish, which the end of a tour has not
+    :param backwards: Whether the legs before both may vanish, which the start of a tour has not
+    :return: The new length of the queue, -1 if nothing has changed
+    """
     v = plan.nodes[a].owner
     p = plan.nodes[a].position
     route = plan.routes[v]
+    b = route[q]
     for forward in (True, False):
-        q = plan.nodes[b].position if b > 0 else 0 if forward else plan.tours[v].size + 1
+        if not (forwards if forward else backwards):
+            continue
         # The neighbors on the side of the legs that vanish.
         next_a = route[p + 1] if forward else route[p - 1]
         next_b = route[q + 1] if forward else route[q - 1]
@@ -375,22 +402,24 @@ def try_two_opt(plan, n_queued, a, b, distance_ab):
 
 @njit(cache=True, nogil=True)
 def try_exchange(plan, n_queued, a, b, distance_ab):
-    """Swap ``a`` with a neighbor of ``b`` in another tour. Parameters as of :func:`try_segments`."""
+    """Swap ``a`` with a neighbor of ``b``, a task of another tour; returns as :func:`try_segments`."""
     v, w = plan.nodes[a].owner, plan.nodes[b].owner
     p = plan.nodes[a].position
     before, behind = plan.routes[v, p - 1], plan.routes[v, p + 1]
     old = distance(plan, before, a) + distance(plan, a, behind)
     for side in (1, -1):
         q = plan.nodes[b].position + side
-        c = plan.routes[w, q]
-        if c == 0:
+        if q == 0 or q > plan.tours[w].size:
             continue
+        c = plan.routes[w, q]
         beyond = plan.routes[w, q + side]
         change_w = distance_ab + distance(plan, a, beyond) - distance(plan, b, c) - distance(plan, c, beyond)
         change_v = distance(plan, before, c) + distance(plan, c, behind) - old
         if change_v + change_w >= -EPSILON:
             continue
-        if plan.tours[v].length + change_v > plan.state[0].limit or plan.tours[w].length + change_w > plan.state[0].limit:
+        change_v += plan.nodes[c].service - plan.nodes[a].service
+        change_w += plan.nodes[a].service - plan.nodes[c].service
+        if plan.tours[v].length + change_v > plan.tours[v].limit or plan.tours[w].length + change_w > plan.tours[w].limit:
             continue
         plan.routes[v, p], plan.routes[w, q] = c, a
         plan.nodes[a].owner, plan.nodes[c].owner = w, v
@@ -405,17 +434,28 @@ def try_exchange(plan, n_queued, a, b, distance_ab):
 
 @njit(cache=True, nogil=True)
 def head_length(plan, v, p):
-    """Length of tour ``v`` from its start to position ``p``."""
+    """Length of tour ``v`` from its start to position ``p``, with the service there."""
     length = 0.0
     for k in range(p):
-        length += distance(plan, plan.routes[v, k], plan.routes[v, k + 1])
+        length += distance(plan, plan.routes[v, k], plan.routes[v, k + 1]) + plan.nodes[plan.routes[v, k + 1]].service
     return length
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def terminal_change(plan, node, new, old):
+    """By how much the leg between a node and a terminal grows when another takes its place: exactly 0 for the same one."""
+    return distance(plan, node, new) - distance(plan, node, old) if new != old else 0.0
 
 
 @njit(cache=True, nogil=True)
 def try_crossing(plan, n_queued, a, b, distance_ab):
-    """2-opt*: join two tours at ``a`` and ``b``, and what is left of them. Parameters as of :func:`try_segments`."""
+    """
+    2-opt*: join two tours at the tasks ``a`` and ``b``, and what is left of them; returns as :func:`try_segments`.
+
+    Tails that change their tour leave their terminals behind.
+    """
     v, w = plan.nodes[a].owner, plan.nodes[b].owner
+    size_v, size_w = plan.tours[v].size, plan.tours[w].size
     for variant in range(3):
         p, q = plan.nodes[a].position, plan.nodes[b].position
         # Positions of the last stop before the leg that vanishes, in either tour.
@@ -426,28 +466,34 @@ def try_crossing(plan, n_queued, a, b, distance_ab):
             q -= 1
         route_v, route_w = plan.routes[v], plan.routes[w]
         end_v, start_v, end_w, start_w = route_v[p], route_v[p + 1], route_w[q], route_w[q + 1]
+        last_v, last_w = route_v[size_v + 1], route_w[size_w + 1]
         change = -distance(plan, end_v, start_v) - distance(plan, end_w, start_w)
-        # Heads are joined to tails, or heads to heads and tails to tails.
+        # Heads are joined to tails, or heads to heads and tails to tails. The stop beside a terminal that is exchanged may be
+        # that on the other side of the new leg.
         if variant == 0:
             change += distance_ab + distance(plan, end_w, start_v)
-        elif variant == 1:
-            change += distance_ab + distance(plan, start_v, start_w)
+            more_v = terminal_change(plan, route_w[size_w] if q < size_w else end_v, last_v, last_w)
+            more_w = terminal_change(plan, route_v[size_v] if p < size_v else end_w, last_w, last_v)
         else:
-            change += distance_ab + distance(plan, end_v, end_w)
-        if change >= -EPSILON:
+            if variant == 1:
+                change += distance_ab + distance(plan, start_v, start_w)
+            else:
+                change += distance_ab + distance(plan, end_v, end_w)
+            more_v = terminal_change(plan, route_w[1] if q > 0 else end_v, last_v, route_w[0])
+            more_w = terminal_change(plan, route_v[size_v] if p < size_v else start_w, route_w[0], last_v)
+        if change + (more_v + more_w) >= -EPSILON:
             continue
         head_v, head_w = head_length(plan, v, p), head_length(plan, w, q)
         tail_v = plan.tours[v].length - head_v - distance(plan, end_v, start_v)
         tail_w = plan.tours[w].length - head_w - distance(plan, end_w, start_w)
         if variant == 0:
-            new_v = head_v + tail_w + distance(plan, end_v, start_w)
-            new_w = head_w + tail_v + distance(plan, end_w, start_v)
+            new_v = head_v + tail_w + distance(plan, end_v, start_w) + more_v
+            new_w = head_w + tail_v + distance(plan, end_w, start_v) + more_w
         else:
-            new_v = head_v + head_w + distance(plan, end_v, end_w)
-            new_w = tail_v + tail_w + distance(plan, start_v, start_w)
-        if new_v > plan.state[0].limit or new_w > plan.state[0].limit:
+            new_v = head_v + head_w + distance(plan, end_v, end_w) + more_v
+            new_w = tail_v + tail_w + distance(plan, start_v, start_w) + more_w
+        if new_v > plan.tours[v].limit or new_w > plan.tours[w].limit:
             continue
-        size_v, size_w = plan.tours[v].size, plan.tours[w].size
         old_v, old_w = route_v[: size_v + 2].copy(), route_w[: size_w + 2].copy()
         if variant == 0:
             plan.tours[v].size = p + size_w - q
@@ -460,12 +506,37 @@ def try_crossing(plan, n_queued, a, b, distance_ab):
             route_v[p + 1 : p + q + 2] = old_w[q::-1]
             route_w[: size_v - p + 1] = old_v[:p:-1]
             route_w[size_v - p + 1 : plan.tours[w].size + 2] = old_w[q + 1 :]
+            route_w[0] = old_w[0]
+        route_v[plan.tours[v].size + 1] = last_v
+        route_w[plan.tours[w].size + 1] = last_w
         measure(plan, v)
         measure(plan, w)
         for node in (end_v, start_v, end_w, start_w):
             n_queued = push(plan, n_queued, node)
         return n_queued
     return -1
+
+
+@njit(cache=True, nogil=True)
+def try_terminals(plan, n_queued, a, v, longest, saved):
+    """
+    Join ``a`` to the start or to the end of its own tour ``v``; returns as :func:`try_segments`.
+
+    :param longest: How long the new leg may be
+    :param saved: See :func:`survey_segments`
+    """
+    last = plan.tours[v].size + 1
+    to_start, to_end = distance(plan, a, plan.routes[v, 0]), distance(plan, a, plan.routes[v, last])
+    n = -1
+    if to_start < longest:
+        n = try_two_opt(plan, n_queued, a, 0, to_start, True, False)
+    if n < 0 and to_end < longest:
+        n = try_two_opt(plan, n_queued, a, last, to_end, False, True)
+    if n < 0 and to_start < longest:
+        n = try_segments(plan, n_queued, a, v, 0, to_start, saved)
+    if n < 0 and to_end < longest:
+        n = try_segments(plan, n_queued, a, v, last, to_end, saved)
+    return n
 
 
 @njit(cache=True, nogil=True)
@@ -486,24 +557,27 @@ def shorten(plan, n_queued, n_near):
         improved = plan.nodes[a].owner >= 0
         while improved:
             improved = False
-            v, p = plan.nodes[a].owner, plan.nodes[a].position
+            v, p = np.int64(plan.nodes[a].owner), plan.nodes[a].position
             longest = max(distance(plan, plan.routes[v, p - 1], a), distance(plan, a, plan.routes[v, p + 1]))
             longest = max(longest, survey_segments(plan, a, saved))
-            for j in range(-2, n_near):
-                b = 0 if j < 0 else np.int64(plan.near[a, j])
+            n = try_terminals(plan, n_queued, a, v, longest, saved)
+            if n >= 0:
+                n_queued = n
+                improved = changed = True
+                continue
+            for j in range(n_near):
+                b = np.int64(plan.near[a, j])
                 distance_ab = distance(plan, a, b)
                 if distance_ab >= longest:
-                    if j < 0:
-                        continue
                     break
-                if j >= 0 and plan.nodes[b].owner < 0:
+                w, q = np.int64(plan.nodes[b].owner), np.int64(plan.nodes[b].position)
+                if w < 0:
                     continue
-                n = -1
-                if j < 0 or plan.nodes[b].owner == v:
-                    n = try_two_opt(plan, n_queued, a, b, distance_ab) if j != -1 else -1
+                if w == v:
+                    n = try_two_opt(plan, n_queued, a, q, distance_ab, True, True)
                 if n < 0:
-                    n = try_segments(plan, n_queued, a, b, distance_ab, j == -2, saved)
-                if n < 0 and j >= 0 and plan.nodes[b].owner != v:
+                    n = try_segments(plan, n_queued, a, w, q, distance_ab, saved)
+                if n < 0 and w != v:
                     n = try_exchange(plan, n_queued, a, b, distance_ab)
                     if n < 0:
                         n = try_crossing(plan, n_queued, a, b, distance_ab)
@@ -525,8 +599,8 @@ def offer(plan, task, v, a, b):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def offer_at(plan, task, v, a, added):
-    """The same, when the added length is already known."""
-    if added < plan.nodes[task].cost and plan.tours[v].length + added <= plan.state[0].limit:
+    """The same, when the added length of legs is already known."""
+    if added < plan.nodes[task].cost and plan.tours[v].length + (added + plan.nodes[task].service) <= plan.tours[v].limit:
         plan.nodes[task].cost = added
         plan.nodes[task].tour = v
         plan.nodes[task].after = a
@@ -544,7 +618,7 @@ def look_everywhere(plan, task):
 
 @njit(cache=True, nogil=True)
 def look_around(plan, task, n_near):
-    """Find the cheapest place of a task beside its ``n_near`` neighbors and the depot; everywhere if that is None."""
+    """Find the cheapest place of a task beside its ``n_near`` neighbors and the terminals; everywhere if that is None."""
     if n_near == 0:
         look_everywhere(plan, task)
         return
@@ -558,8 +632,9 @@ def look_around(plan, task, n_near):
             offer(plan, task, v, plan.routes[v, p - 1], a)
             offer(plan, task, v, a, plan.routes[v, p + 1])
     for v in range(len(plan.tours)):
-        offer(plan, task, v, 0, plan.routes[v, 1])
-        offer(plan, task, v, plan.routes[v, plan.tours[v].size], 0)
+        size = plan.tours[v].size
+        offer(plan, task, v, plan.routes[v, 0], plan.routes[v, 1])
+        offer(plan, task, v, plan.routes[v, size], plan.routes[v, size + 1])
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -628,9 +703,11 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         while i < n_candidates:
             task = plan.lists[CANDIDATES, i]
             v = plan.nodes[task].tour
-            if v >= 0 and plan.tours[v].length + plan.nodes[task].cost > plan.state[0].limit:
+            cost = plan.nodes[task].cost + plan.nodes[task].service
+            if v >= 0 and plan.tours[v].length + cost > plan.tours[v].limit:
                 look_around(plan, task, n_near)
                 v = plan.nodes[task].tour
+                cost = plan.nodes[task].cost + plan.nodes[task].service
             if v < 0 and n_near > 0:
                 # It comes back when a leg beside it appears.
                 n_candidates -= 1
@@ -640,7 +717,7 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
             if v < 0:
                 i += 1
                 continue
-            worth = plan.nodes[task].noise * plan.nodes[task].value / max(plan.nodes[task].cost, EPSILON)
+            worth = plan.nodes[task].noise * plan.nodes[task].value / max(cost, EPSILON)
             if worth > best_worth:
                 best, best_worth = i, worth
             i += 1
@@ -651,9 +728,9 @@ def fill(plan, n_candidates, n_touched, n_near, blink, spread):
         plan.lists[CANDIDATES, best] = plan.lists[CANDIDATES, n_candidates]
         v, a = plan.nodes[task].tour, np.int64(plan.nodes[task].after)
         n_touched = keep(plan, n_touched, v)
-        place = plan.nodes[a].position + 1 if a > 0 else 1
+        place = plan.nodes[a].position + 1 if a != plan.routes[v, 0] else 1
         b = plan.routes[v, place]
-        insert(plan, v, place, task, plan.nodes[task].cost)
+        insert(plan, v, place, task, plan.nodes[task].cost + plan.nodes[task].service)
         for i in range(n_candidates):
             other = plan.lists[CANDIDATES, i]
             if plan.nodes[other].tour == v and plan.nodes[other].after == a:
@@ -676,7 +753,7 @@ def fill_everywhere(plan):
     plan.state[0].clock += 1
     before = count_visited(plan)
     n_candidates = 0
-    for task in range(1, len(plan.nodes)):
+    for task in range(1, plan.state[0].n_tasks + 1):
         if plan.nodes[task].owner < 0:
             n_candidates = enter(plan, n_candidates, task, 0.0, 0.0)
             look_everywhere(plan, task)
@@ -690,11 +767,12 @@ def fill_everywhere(plan):
 def replace(plan):  # noqa: C901 (compiled: every call of a helper would pass the whole state)
     """Swap visited tasks for unvisited ones that are worth more, or as much on a shorter tour; returns how often."""
     count = 0
-    leg, saved, reach = np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1), np.empty(len(plan.nodes) + 1)
+    n_stops = plan.state[0].n_tasks + 2
+    leg, saved, reach = np.empty(n_stops), np.empty(n_stops), np.empty(n_stops)
     for v in range(len(plan.tours)):
         route = plan.routes[v]
         stale = True
-        for task in range(1, len(plan.nodes)):
+        for task in range(1, plan.state[0].n_tasks + 1):
             if plan.nodes[task].owner >= 0:
                 continue
             size = plan.tours[v].size
@@ -732,8 +810,8 @@ def replace(plan):  # noqa: C901 (compiled: every call of a helper would pass th
                         if cost < added:
                             at, added = k, cost
                         break
-                change = added - saved[p]
-                if (gain > best_gain or change < best_change) and plan.tours[v].length + change <= plan.state[0].limit:
+                change = added - saved[p] + (plan.nodes[task].service - plan.nodes[route[p]].service)
+                if (gain > best_gain or change < best_change) and plan.tours[v].length + change <= plan.tours[v].limit:
                     best, best_leg, best_gain, best_change = p, at, gain, change
             if best < 0:
                 continue
@@ -756,15 +834,45 @@ def replace(plan):  # noqa: C901 (compiled: every call of a helper would pass th
 def ruin(plan, n_removed, v, first, count):
     """Take a string of tasks out of tour ``v``; returns the number of removed tasks."""
     route = plan.routes[v]
+    old = 0.0
     for p in range(first, first + count):
         plan.lists[REMOVED, n_removed] = route[p]
         n_removed += 1
-    old = 0.0
+        old += plan.nodes[route[p]].service
     for p in range(first, first + count + 1):
         old += distance(plan, route[p - 1], route[p])
     plan.tours[v].length += distance(plan, route[first - 1], route[first + count]) - old
     cut(plan, v, first, count)
     return n_removed
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def account(plan, n_touched):
+    """Measure the copied tours; returns by how much value and length of all tours have grown since the trial began."""
+    value, length = 0.0, 0.0
+    for i in range(n_touched):
+        v = plan.lists[TOUCHED, i]
+        measure(plan, v)
+        length += plan.tours[v].length - plan.tours[v].old_length
+        for p in range(1, plan.tours[v].size + 1):
+            value += plan.nodes[plan.routes[v, p]].value
+        for p in range(1, plan.tours[v].old_size + 1):
+            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    return value, length
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def keep_empty(plan, n_touched):
+    """
+    Where UAVs differ, copy the empty tours, so that they are filled as well: no string is ever taken out of them.
+
+    :return: The number of copied tours
+    """
+    if not plan.state[0].equal:
+        for v in range(len(plan.tours)):
+            if plan.tours[v].size == 0 and plan.tours[v].length <= plan.tours[v].limit:
+                n_touched = keep(plan, n_touched, v)
+    return n_touched
 
 
 @njit(cache=True, nogil=True)
@@ -781,13 +889,15 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
         n_candidates = enter(plan, n_candidates, task, blink, spread)
         if plan.nodes[task].noise > 0.0:
             look_around(plan, task, n_near)
+    n_touched = keep_empty(plan, n_touched)
     for i in range(n_touched):
         v = plan.lists[TOUCHED, i]
         route = plan.routes[v]
         leg_before = 0.0
-        for p in range(plan.tours[v].size + 1):
+        last = plan.tours[v].size + 1
+        for p in range(last):
             node, behind = route[p], route[p + 1]
-            before = route[p - 1] if p > 0 else 0
+            before = route[p - 1] if p > 0 else route[0]
             leg_behind = distance(plan, node, behind)
             for j in range(n_near):
                 task = np.int64(plan.near[node, j])
@@ -800,16 +910,15 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
                     if p > 0:
                         offer_at(plan, task, v, before, reach + distance(plan, task, before) - leg_before)
             leg_before = leg_behind
+        # What is near the end of a tour is near its start, unless they are different.
+        for j in range(n_near if route[last] != route[0] else 0):
+            task = np.int64(plan.near[route[last], j])
+            if plan.nodes[task].owner < 0:
+                n_candidates = enter(plan, n_candidates, task, blink, spread)
+                if plan.nodes[task].noise > 0.0:
+                    offer(plan, task, v, route[last - 1], route[last])
     n_touched = fill(plan, n_candidates, n_touched, n_near, blink, spread)
-    value, length = 0.0, 0.0
-    for i in range(n_touched):
-        v = plan.lists[TOUCHED, i]
-        measure(plan, v)
-        length += plan.tours[v].length - plan.tours[v].old_length
-        for p in range(1, plan.tours[v].size + 1):
-            value += plan.nodes[plan.routes[v, p]].value
-        for p in range(1, plan.tours[v].old_size + 1):
-            value -= plan.nodes[plan.routes[len(plan.tours) + v, p]].value
+    value, length = account(plan, n_touched)
     return n_touched, value, length
 
 
@@ -817,7 +926,7 @@ def recreate(plan, n_removed, n_touched, n_near, blink, spread):
 def eject(plan, n_near, max_string):
     """Take every string of up to ``max_string`` tasks out and fill the gap, wherever that is better; returns how often."""
     count = 0
-    for task in range(1, len(plan.nodes)):
+    for task in range(1, plan.state[0].n_tasks + 1):
         for length in range(1, max_string + 1):
             v = plan.nodes[task].owner
             if v < 0:
@@ -832,6 +941,80 @@ def eject(plan, n_near, max_string):
             if value > EPSILON or (value > -EPSILON and change < -EPSILON):
                 count += 1
             else:
+                put_back(plan, n_touched)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def make_room(plan, task, v, keep_rest):
+    """
+    Put an unvisited task into tour ``v``, which has to be copied before, whatever has to leave.
+
+    :param keep_rest: Whether only so many tasks leave that it fits, those first whose value is least for what they take; else
+        all leave
+    :return: The number of removed tasks, -1 if even then it does not fit
+    """
+    route = plan.routes[v]
+    n_removed = 0
+    if not keep_rest and plan.tours[v].size > 0:
+        n_removed = ruin(plan, n_removed, v, 1, plan.tours[v].size)
+    place, least = -1, NOWHERE
+    for p in range(1, plan.tours[v].size + 2):
+        added = distance(plan, route[p - 1], task) + distance(plan, task, route[p]) - distance(plan, route[p - 1], route[p])
+        if added < least:
+            place, least = p, added
+    insert(plan, v, place, task, least + plan.nodes[task].service)
+    while plan.tours[v].length > plan.tours[v].limit:
+        out, least = -1, NOWHERE
+        for p in range(1, plan.tours[v].size + 1):
+            if route[p] == task:
+                continue
+            saved = distance(plan, route[p - 1], route[p]) + distance(plan, route[p], route[p + 1])
+            saved += plan.nodes[route[p]].service - distance(plan, route[p - 1], route[p + 1])
+            worth = plan.nodes[route[p]].value / max(saved, EPSILON)
+            if worth < least:
+                out, least = p, worth
+        if out < 0:
+            return -1
+        n_removed = ruin(plan, n_removed, v, out, 1)
+    return n_removed
+
+
+@njit(cache=True, nogil=True)
+def admit(plan, n_near):
+    """
+    Make room for unvisited tasks and insert what had to leave elsewhere, wherever that is worth more; returns how often.
+
+    For a task that is dear to a tour all of it may leave. Where UAVs are equal, only such tasks are tried: the others come in
+    where strings are taken out.
+
+    :param n_near: Beside how many neighbors a task may be inserted
+    """
+    count = 0
+    for task in range(1, plan.state[0].n_tasks + 1):
+        for v in range(len(plan.tours)):
+            if plan.nodes[task].owner >= 0:
+                break
+            size = plan.tours[v].size
+            value = 0.0
+            for p in range(1, size + 1):
+                value += plan.nodes[plan.routes[v, p]].value
+            is_dear = plan.nodes[task].value * size > value * min(size, DEAR)
+            alone = distance(plan, plan.routes[v, 0], task) + distance(plan, task, plan.routes[v, size + 1])
+            if alone + plan.nodes[task].service > plan.tours[v].limit or (plan.state[0].equal and not is_dear):
+                continue
+            for keep_rest in (True, False):
+                if not keep_rest and not is_dear:
+                    break
+                plan.state[0].clock += 1
+                n_touched = keep(plan, 0, v)
+                n_removed = make_room(plan, task, v, keep_rest)
+                gain = -1.0
+                if n_removed >= 0:
+                    n_touched, gain, _ = recreate(plan, n_removed, n_touched, n_near, 0.0, 0.0)
+                if gain > EPSILON:
+                    count += 1
+                    break
                 put_back(plan, n_touched)
     return count
 
@@ -859,7 +1042,7 @@ def descend(plan, n_near_joined, n_near_inserted, max_string):
         return True
     if changed or max_string == 0:
         return changed
-    return eject(plan, n_near_inserted, max_string) > 0
+    return eject(plan, n_near_inserted, max_string) > 0 or admit(plan, n_near_inserted) > 0
 
 
 @njit(cache=True, nogil=True)
@@ -878,7 +1061,7 @@ def ruin_around(plan, mean_removed, longest):
         return 0, 0
     longest_here = max(1.0, min(longest, n_served / n_flying))
     n_strings = int(1.0 + uniform(plan) * max(4.0 * mean_removed / (1.0 + longest_here) - 1.0, 0.0))
-    seed = 1 + int(uniform(plan) * (len(plan.nodes) - 1))
+    seed = 1 + int(uniform(plan) * plan.state[0].n_tasks)
     for j in range(-1, plan.near.shape[1]):
         task = seed if j < 0 else np.int64(plan.near[seed, j])
         v = plan.nodes[task].owner
@@ -906,6 +1089,25 @@ def ruin_around(plan, mean_removed, longest):
 
 
 @njit(cache=True, nogil=True)
+def extraordinary_value(plan, visited):
+    """What visited or unvisited tasks are worth beyond the ordinary."""
+    total = 0.0
+    for task in range(1, plan.state[0].n_tasks + 1):
+        if (plan.nodes[task].owner >= 0) == visited:
+            total += max(plan.nodes[task].value - plan.state[0].ordinary, 0.0)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def copy_routes(source, target):
+    """Make the routes of ``target`` those of ``source``; owners and positions are not."""
+    for v in range(len(source.tours)):
+        size = source.tours[v].size
+        target.tours[v].size = size
+        target.routes[v, : size + 2] = source.routes[v, : size + 2]
+
+
+@njit(cache=True, nogil=True)
 def anneal(plan, best, n_trials, progress_before, progress_after, settings):
     """
     Ruin and recreate, with worse schedules accepted as in simulated annealing.
@@ -916,13 +1118,23 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
     :param progress_after: Which part will lie behind after these
     :param settings: :class:`AnnealingSettings`
     """
-    scale = 0.0
-    for task in range(1, len(plan.nodes)):
-        scale += plan.nodes[task].value
-    scale /= len(plan.nodes) - 1
-    value, length = total_value(plan), total_length(plan)
+    scale, mean = 0.0, 0.0
+    for task in range(1, plan.state[0].n_tasks + 1):
+        scale += min(plan.nodes[task].value, plan.state[0].ordinary)
+        mean += plan.nodes[task].value
+    scale /= plan.state[0].n_tasks
     measure_all(best)
     best_value, best_length = total_value(best), total_length(best)
+    # In the end the temperature is one for ordinary tasks; while others are missing, it starts with one for them too.
+    ratio = 1.0
+    if extraordinary_value(best, False) > 0.0:
+        ratio = mean / plan.state[0].n_tasks / scale
+    elif extraordinary_value(plan, False) > 0.0:
+        copy_routes(best, plan)
+        measure_all(plan)
+    value, length, limit = total_value(plan), total_length(plan), 0.0
+    # What is dear beyond measure does not make length dear.
+    beyond = extraordinary_value(plan, True)
     for trial in range(n_trials):
         plan.state[0].clock += 1
         n_removed, n_touched = ruin_around(plan, settings.mean_removed, settings.longest_string)
@@ -931,19 +1143,29 @@ def anneal(plan, best, n_trials, progress_before, progress_after, settings):
                 # This is where we begin, or a trial has overlooked all that it had taken out.
                 fill_everywhere(plan)
                 value, length = total_value(plan), total_length(plan)
+                beyond = extraordinary_value(plan, True)
             continue
+        closed = -1
+        if not plan.state[0].equal and uniform(plan) < CLOSED:
+            # Else a task always goes where it adds least, and never makes way for one that only this UAV can serve.
+            closed = int(uniform(plan) * len(plan.tours))
+            limit = plan.tours[closed].limit
+            plan.tours[closed].limit = -1.0
         n_touched, gain, change = recreate(plan, n_removed, n_touched, settings.n_near, settings.blink, settings.noise)
+        if closed >= 0:
+            plan.tours[closed].limit = limit
         progress = progress_before + (progress_after - progress_before) * (trial / n_trials)
         temperature = scale * settings.hot * (settings.cold / settings.hot) ** progress
-        score = gain - settings.thrift * value / max(length, EPSILON) * change
+        if ratio > 1.0:
+            temperature *= ratio ** (1.0 - progress)
+        score = gain - settings.thrift * (value - beyond) / max(length, EPSILON) * change
         if score < 0.0 and uniform(plan) >= math.exp(score / temperature):
             put_back(plan, n_touched)
             continue
         value += gain
         length += change
+        if abs(gain) > plan.state[0].ordinary:
+            beyond = extraordinary_value(plan, True)
         if value > best_value + SAME_VALUE or (value > best_value - SAME_VALUE and length < best_length - EPSILON):
             best_value, best_length = value, length
-            for v in range(len(plan.tours)):
-                size = plan.tours[v].size
-                best.tours[v].size = size
-                best.routes[v, : size + 2] = plan.routes[v, : size + 2]
+            copy_routes(plan, best)

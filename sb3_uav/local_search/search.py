@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,6 +26,11 @@ _MAX_STRING = 3
 # Kernels use values rounded to this many binary digits of the greatest: sums of 100,000 tasks are exact, and differences are
 # far above the threshold for rounding errors of lengths.
 _VALUE_BITS = 36
+# Values above so many medians are out of the ordinary: they count in full, but annealing takes its measure from the others.
+_ORDINARY_MEDIANS = 8.0
+# Bound of the rounding errors of a tour's length, in units of the largest coordinate. Only for UAVs that fly a tiny part of
+# what another one flies it is more than what USABLE_TOLERANCE leaves.
+_ROUNDING = 1e-14
 # Ruin and recreate returns to Python about this often, in seconds, to look at the clock.
 _CHUNK_SECONDS = 0.02
 # The repair after it ends at the latest so many seconds after the given time.
@@ -46,23 +52,45 @@ class LocalSearch:
     def __init__(self, instance: Instances) -> None:
         if len(instance) != 1:
             raise ValueError(f"Local search treats one instance at a time, found {len(instance)}; select one by its index.")
-        self.instance = instance = instance.to("cpu")
-        depot, max_distance = instance.depot[0].numpy(), float(instance.max_distance[0])
-        points, values = (instance.tasks[0].numpy() - depot) / max_distance, instance.values[0].numpy()
-        within_reach = 2.0 * np.hypot(points[:, 0], points[:, 1]) <= (1.0 + DISTANCE_TOLERANCE) ** 2
-        self._tasks = np.flatnonzero(instance.task_mask[0].numpy() & (values > 0) & within_reach)
-        self._nodes = np.zeros(len(self._tasks) + 1, kernels.NODE)
-        self._nodes["x"][1:], self._nodes["y"][1:] = points[self._tasks].T
+        instance = instance.to("cpu")
+        # What must be served is a matter of value.
+        self.instance = instance = replace(instance, values=instance.prizes, must_serve=None)
+        # Equal UAVs are looked at once.
+        fleet = instance.with_fleet(1) if instance.has_equal_uavs else instance
+        starts, ends, limits = (field[0].numpy() for field in (fleet.uav_start, fleet.uav_end, fleet.uav_distance))
+        # Far from the origin, and for distances of any magnitude, numbers are of about 1.
+        origin, unit = starts[0], float(instance.unit[0])
+        points, starts, ends = ((field - origin) / unit for field in (instance.tasks[0].numpy(), starts, ends))
+        limits, service, values = limits / unit, instance.service_cost[0].numpy() / unit, instance.values[0].numpy()
+        outward, homeward = (np.hypot(*(points - ends_of[:, None]).transpose(2, 0, 1)) for ends_of in (starts, ends))
+        within_reach = outward + homeward + service <= limits[:, None] * (1.0 + DISTANCE_TOLERANCE) ** 2
+        self._tasks = np.flatnonzero(instance.task_mask[0].numpy() & (values > 0) & within_reach.any(0))
+        n_tasks = len(self._tasks)
+        terminals, numbers = np.unique(np.concatenate([starts, ends]), axis=0, return_inverse=True)
+        # Node 0 is where the first UAV starts, other terminals follow the tasks.
+        first = numbers.flat[0]
+        node_of_terminal = n_tasks + np.arange(len(terminals)) + (np.arange(len(terminals)) < first)
+        node_of_terminal[first] = 0
+        self._starts, self._ends = node_of_terminal[numbers.reshape(2, -1)]
+        self._nodes = np.zeros(n_tasks + len(terminals), kernels.NODE)
+        for nodes, places in ((node_of_terminal, terminals), (slice(1, n_tasks + 1), points[self._tasks])):
+            self._nodes["x"][nodes], self._nodes["y"][nodes] = places.T
+        self._nodes["service"][1 : n_tasks + 1] = service[self._tasks]
+        self._nodes["owner"] = -1
+        self._nodes["queued"][node_of_terminal] = True
         # In whole multiples of a power of two, so that kernels add them up without rounding errors: else a search that takes
         # such an error for a gain never ends. At most 1, so that sums neither vanish nor overflow.
         values = values[self._tasks]
         scaled = np.ldexp(values, _VALUE_BITS - np.frexp(values.max(initial=0.0))[1])
-        self._nodes["value"][1:] = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -_VALUE_BITS)
+        rounded = np.ldexp(np.maximum(np.ceil(scaled), 1.0), -_VALUE_BITS)
+        self._nodes["value"][1 : n_tasks + 1] = rounded
+        self._ordinary = _ORDINARY_MEDIANS * float(np.median(rounded)) if n_tasks > 0 else np.inf
         self._node_of_task = np.zeros(instance.n_tasks, np.int64)
-        self._node_of_task[self._tasks] = np.arange(1, len(self._tasks) + 1)
-        self._limit = 1.0 + USABLE_TOLERANCE
-        self._near = np.zeros((len(self._nodes), max(min(_N_NEAR, len(self._tasks) - 1), 0)), np.int32)
-        kernels.find_near(self._nodes, self._near)
+        self._node_of_task[self._tasks] = np.arange(1, n_tasks + 1)
+        largest = max(abs(self._nodes["x"]).max(), abs(self._nodes["y"]).max(), 1.0)
+        self._limits = np.minimum(limits * (1.0 + USABLE_TOLERANCE), limits * (1.0 + DISTANCE_TOLERANCE) - _ROUNDING * largest)
+        self._near = np.zeros((len(self._nodes), max(min(_N_NEAR, n_tasks - 1), 0)), np.int32)
+        kernels.find_near(self._nodes, n_tasks, self._near)
 
     def _load(self, schedule: Schedule, seed: int = 0) -> Plan:
         """
@@ -71,22 +99,24 @@ class LocalSearch:
         :return: The data of the kernels
         """
         n_tasks = len(self._tasks)
-        # UAVs beyond the number of tasks are useless, and each costs memory.
-        n_uavs = max(min(self.instance.n_uavs, self.instance.n_tasks), len(schedule.routes))
-        nodes = self._nodes.copy()
-        nodes["owner"] = -1
+        # Useless UAVs cost memory.
+        n_uavs = max(self.instance.useful_fleet, len(schedule.routes))
         state = np.zeros(1, kernels.STATE)
-        state["limit"] = self._limit
+        state["n_tasks"], state["equal"], state["ordinary"] = n_tasks, self.instance.has_equal_uavs, self._ordinary
         # The state of the generator must not be 0.
         state["random"] = mixed_state(seed) | np.uint64(1)
         routes = np.zeros((2 * n_uavs, n_tasks + 2), np.int64)
         tours = np.zeros(n_uavs, kernels.TOUR)
+        tours["limit"] = self._limits
         for uav, route in enumerate(schedule.routes):
             stops = self._node_of_task[list(route)]
             stops = stops[stops > 0]
             routes[uav, 1 : len(stops) + 1] = stops
             tours["size"][uav] = len(stops)
-        plan = Plan(nodes, self._near, routes, tours, np.zeros((4, n_tasks + n_uavs + 1), np.int64), state)
+        routes[:n_uavs, 0] = self._starts
+        routes[np.arange(n_uavs), tours["size"] + 1] = self._ends
+        lists = np.zeros((4, n_tasks + n_uavs + 1), np.int64)
+        plan = Plan(self._nodes.copy(), self._near, routes, tours, lists, state)
         kernels.measure_all(plan)
         return plan
 
@@ -112,6 +142,16 @@ class LocalSearch:
         new, old = self.report(found), self.report(given)
         return found if (new.objective, -new.length) >= (old.objective, -old.length) else given
 
+    def insertion(self) -> Schedule:
+        """
+        Cheapest insertion from empty tours: always the task that is worth most per added length.
+
+        :return: A feasible schedule
+        """
+        plan = self._load(Schedule([]))
+        kernels.fill_everywhere(plan)
+        return self._unload(plan)
+
     def repair(self, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
         """See :func:`repair`."""
         end = time.perf_counter() + (np.inf if seconds is None else seconds)
@@ -135,6 +175,9 @@ class LocalSearch:
         settings = settings or AnnealingSettings()
         plan = self._load(schedule, seed)
         best = self._load(schedule)
+        # Annealing does not find a dear task that costs a whole tour; it has to begin with it.
+        for each in (plan, best):
+            kernels.admit(each, _N_NEAR_INSERTED)
         if len(self._tasks) > 0:
             if seconds is None:
                 n_trials = _TRIALS_PER_TASK * len(self._tasks) if n_trials is None else n_trials
@@ -174,7 +217,7 @@ def warm_up() -> None:
     """
     instance = UniformGenerator(8, n_uavs=2)(1, keyed_generator(WARM_UP_SEED))
     search = LocalSearch(instance)
-    search.repair(search.improve(Schedule([])))
+    search.repair(search.improve(search.insertion()))
 
 
 def repair(instance: Instances, schedule: Schedule, seconds: float | None = None, max_string: int = _MAX_STRING) -> Schedule:
@@ -182,9 +225,11 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
     Local search until nothing changes.
 
     Makes tours shorter (2-opt and or-opt within a tour, relocation, exchange and 2-opt* between two), inserts unvisited tasks
-    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, and takes short strings of
-    tasks out to fill the gap better. Deterministic, and a second repair changes nothing. Differences between values below
-    1e-10 of the greatest do not count, but the result is never worse for them.
+    wherever they fit, swaps visited tasks for unvisited ones that are worth more or cost less, takes short strings of tasks
+    out to fill the gap better, and empties a tour, or a part of it, for a task that is worth more: of all tasks in reach the
+    one that is worth more than the others together is never missed. Deterministic, and a second repair changes nothing.
+    Differences between values below 1e-10 of the greatest do not count, but the result is never worse for them. With tasks
+    that must be served, values are :attr:`~sb3_uav.envs.instances.Instances.prizes`.
 
     :param instance: A batch of one, possibly padded
     :param schedule: A feasible schedule of it
@@ -195,6 +240,21 @@ def repair(instance: Instances, schedule: Schedule, seconds: float | None = None
     :raises ValueError: If there is not exactly one instance
     """
     return LocalSearch(instance).repair(schedule, seconds, max_string)
+
+
+def repaired_insertion(instance: Instances, seconds: float | None = None) -> Schedule:
+    """
+    Cheapest insertion, then local search until nothing changes: a good schedule in a few milliseconds, whatever the instance.
+
+    :param instance: A batch of one, possibly padded
+    :param seconds: When to stop, but not before the insertion has ended; None for never
+    :return: A feasible schedule
+    :raises ValueError: If there is not exactly one instance
+    """
+    start = time.perf_counter()
+    search = LocalSearch(instance)
+    inserted = search.insertion()
+    return search.repair(inserted, None if seconds is None else start + seconds - time.perf_counter())
 
 
 def repair_best(instance: Instances, schedules: Iterable[Schedule], seconds: float | None = None) -> Schedule:

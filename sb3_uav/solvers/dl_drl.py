@@ -34,7 +34,8 @@ class DLDRL(BatchedSolver):
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: Label in tables and files; describes the decoding when None
-    :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.local_search.search.repair`
+    :param repair: Whether to repair the best of the schedules, see :func:`~sb3_uav.local_search.search.repair`; the result is
+        never worse than repaired cheapest insertion
     :param polish: Seconds per instance for improving the best schedule, see :func:`~sb3_uav.solvers.postprocess.polish`
     :param time_limit: Seconds per instance in all, averaged over a batch, when :meth:`solve` is given none: a part of them
         limits the number of samples, the rest is for repair and polish
@@ -111,18 +112,20 @@ class DLDRL(BatchedSolver):
             seconds = time_limit * len(instances)
         share = 1.0 - self.refinement.share
         on_cpu, instances = instances, instances.to(self.allocator.device)
+        first = self.refinement.first_candidates(on_cpu, start + seconds)
         self.allocator.set_training_mode(False)
         decoder = Decoder(self.allocator, self.router, self.decode, self.samples)
         found = Shortlists(len(instances), self.refinement.n_candidates)
         # How long the first block takes is unknown; afterwards, no block is started that would probably end too late.
-        before = start
+        before = time.perf_counter()
         for block in decoder.blocks(instances, rows, seed, hurry=time_limit is not None):
             found.add(block)
             now = time.perf_counter()
             if now + (now - before) > start + share * seconds:
                 break
             before = now
-        return self.refinement(on_cpu, found.schedules(), start + seconds, seed)
+        candidates = [[*early, *late] for early, late in zip(first, found.schedules(), strict=True)]
+        return self.refinement(on_cpu, candidates, start + seconds, seed)
 
 
 def load_dl_drl(

@@ -29,6 +29,9 @@ class Refinement:
     """
     Repairs and polishes schedules.
 
+    Repaired cheapest insertion is always among them, so that the result is never worse, however strange an instance is to the
+    networks and however short the time.
+
     Works on several instances at once, in as many threads as torch may use; compiled code and PyVRP do most of the work.
 
     :param repair: Whether to repair the best schedules of every instance and keep the best
@@ -67,34 +70,60 @@ class Refinement:
         """Its part of a solver's name."""
         return (" + repair" if self.repair else "") + (f" + polish {self.polish:g} s" if self.polish > 0 else "")
 
+    def first_candidates(self, instances: Instances, deadline: float) -> list[list[Schedule]]:
+        """
+        What needs no networks, found before they run, which may take all the time.
+
+        :param instances: ``batch`` instances on the CPU
+        :param deadline: When to end, in seconds of ``time.perf_counter``
+        :return: A feasible schedule of each; none if nothing is repaired or polished
+        """
+        if not self.is_wanted:
+            return [[] for _ in range(len(instances))]
+        from sb3_uav.local_search.search import repaired_insertion
+
+        n_threads, n_rounds = _threads(instances)
+        seconds = (deadline - time.perf_counter()) / n_rounds
+        with ThreadPoolExecutor(n_threads) as pool:
+            return list(pool.map(lambda i: [repaired_insertion(instances[i], seconds)], range(len(instances))))
+
     def __call__(
         self, instances: Instances, candidates: Sequence[Sequence[Schedule]], deadline: float, seed: int = 0
     ) -> list[Schedule]:
         """
         :param instances: ``batch`` instances on the CPU
-        :param candidates: At least one feasible schedule of each, the best first
+        :param candidates: At least one feasible schedule of each
         :param deadline: When to end, in seconds of ``time.perf_counter``
         :param seed: Seed for polishing
-        :return: One schedule for each, not worse than its best candidate
+        :return: One schedule for each, not worse than its best candidate; if nothing is wanted, its first
         """
         if not self.is_wanted:
             return [found[0] for found in candidates]
         from sb3_uav.local_search.search import repair_best
 
-        n_threads = min(th.get_num_threads(), len(instances))
         # The remaining time is divided equally among the instances; polishing, if requested, gets 70 % of it.
-        n_rounds = math.ceil(len(instances) / n_threads)
+        n_threads, n_rounds = _threads(instances)
         left = (deadline - time.perf_counter()) / n_rounds
         repairing = left * (_REPAIR_SHARE if self.polish > 0 else 1.0)
+        if not self.repair:
+            seconds: float | None = 0.0
+        else:
+            seconds = None if math.isinf(repairing) else max(repairing, _LEAST_REPAIR_SECONDS)
         with ThreadPoolExecutor(n_threads) as pool:
-            best = [found[0] for found in candidates]
-            if self.repair:
-                seconds = None if math.isinf(repairing) else max(repairing, _LEAST_REPAIR_SECONDS)
-                best = list(pool.map(lambda i: repair_best(instances[i], candidates[i], seconds), range(len(instances))))
+            best = list(pool.map(lambda i: repair_best(instances[i], candidates[i], seconds), range(len(instances))))
             seconds = min(self.polish, (deadline - time.perf_counter()) / n_rounds)
             if seconds <= 0:
                 return best
             return list(pool.map(lambda i: polish(instances[i], best[i], seconds, seed), range(len(instances))))
+
+
+def _threads(instances: Instances) -> tuple[int, int]:
+    """
+    :param instances: ``batch`` instances
+    :return: How many to treat at once, and how many one thread treats in turn
+    """
+    n_threads = min(th.get_num_threads(), len(instances))
+    return n_threads, math.ceil(len(instances) / n_threads)
 
 
 def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 0) -> Schedule:
