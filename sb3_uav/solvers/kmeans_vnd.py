@@ -30,6 +30,7 @@ class KMeansVND(OneByOneSolver):
     """
 
     name = "kmeans-vnd"
+    solves_whole_problem = True
     uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
