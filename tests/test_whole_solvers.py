@@ -101,8 +101,8 @@ def test_milp_is_optimal_in_general_position(instance: Instances) -> None:
 )
 def test_whole_values_up_to_a_billion_are_exact(values: list[int], must: bool) -> None:
     """Also beside tasks that must be served, which count as twice all values together."""
-    rng = np.random.default_rng(1)
-    for _ in range(4):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
         points = rng.random((7, 2))
         needed = np.array([must, False, False, False, False, must])
         instance = Instances.from_arrays(points[0], points[1:], values, rng.uniform(0.7, 1.2, 2), 2, must_serve=needed)
