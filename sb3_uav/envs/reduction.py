@@ -90,9 +90,12 @@ class _Fleet:
         :param useful: ``(n_kinds,)`` bool
         :return: The sites of these kinds, ``(n_sites, 2)``, and the kinds
         """
-        ends = np.concatenate([self.start[useful], self.end[useful]])
-        sites, site_of = np.unique(ends, axis=0, return_inverse=True)
-        start, end = site_of.reshape(2, -1).tolist()
+        if self.end is self.start:
+            # One kind, at the depot: without the time that sorting takes.
+            sites, start, end = self.start[useful], [0], [0]
+        else:
+            sites, site_of = np.unique(np.concatenate([self.start[useful], self.end[useful]]), axis=0, return_inverse=True)
+            start, end = site_of.reshape(2, -1).tolist()
         members = [self.members[kind] for kind in np.flatnonzero(useful)]
         return sites, tuple(map(UavKind, start, end, self.limit[useful].tolist(), members))
 
