@@ -186,15 +186,15 @@ def test_the_paper_s_problem_in_other_words(seed: int, field: str) -> None:
     """One depot that every UAV starts from and ends at, or equal distances, however they are given, are no other problem."""
     plain = UniformGenerator(30, n_uavs=3)(1, np.random.default_rng(seed))
     depots = plain.depot[:, None].expand(-1, 3, -1).clone()
-    other = {
+    forms: dict[str, dict[str, Any]] = {
         "start": {"start": depots},
         "end": {"end": depots},
         "both": {"start": depots, "end": depots},
         "service": {"service": th.zeros_like(plain.values)},
         "max_distance": {"max_distance": plain.max_distance[:, None].expand(-1, 3).clone()},
         "must_serve": {"must_serve": th.zeros_like(plain.task_mask)},
-    }[field]
-    same = replace(plain, **other)
+    }
+    same = replace(plain, **forms[field])
     for instance in (plain, same):
         search = LocalSearch(instance)
         assert len(search._nodes) == len(search._tasks) + 1
