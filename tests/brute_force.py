@@ -3,67 +3,89 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from sb3_uav.envs import Instances
 from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 
-Point = tuple[float, float]
-
 
 def largest_value(instances: Instances, row: int = 0) -> float:
     """
-    Written without any of the solvers' code: the shortest tour of every set of tasks by dynamic programming over its subsets,
-    then the best division of the tasks among the UAVs. Takes time in proportion to ``3 ** n_tasks``.
-
-    :param instances: Instances of the whole problem
+    :param instances: The instances
     :param row: Which of them
     :return: The largest sum of prizes of any feasible schedule: its value, if no task must be served
     """
+    n_must, value = best_score(instances, row)
+    if n_must == 0:
+        return value
+    total = float((instances.values * instances.task_mask)[row].sum())
+    return value + n_must * (2 * total if total > 0 else 1.0)
+
+
+def best_score(instances: Instances, row: int = 0) -> tuple[int, float]:
+    """
+    Written without any of the solvers' code: for every UAV the shortest tour of every set of tasks by dynamic programming over
+    its subsets, then the best division of the tasks among the UAVs. Takes time in proportion to ``3 ** n_tasks``.
+
+    :param instances: The instances
+    :param row: Which of them
+    :return: Of the best schedule: the number of tasks that must be served on it, and the total value
+    """
     n_tasks = int(instances.task_mask[row].sum())
-    points = [(x, y) for x, y in instances.tasks[row, :n_tasks].tolist()]
-    prizes, service = instances.prizes[row].tolist(), instances.service_cost[row].tolist()
-    fleet = [
-        (tuple(start), tuple(end), limit * (1 + DISTANCE_TOLERANCE))
-        for start, end, limit in zip(
-            *(field[row].tolist() for field in (instances.uav_start, instances.uav_end, instances.uav_distance)), strict=True
-        )
+    points = instances.tasks[row, :n_tasks].tolist()
+    values, service = instances.values[row].tolist(), instances.service_cost[row].tolist()
+    must = [False] * n_tasks if instances.must_serve is None else instances.must_serve[row].tolist()
+    legs = [[math.hypot(ax - bx, ay - by) for bx, by in points] for ax, ay in points]
+    uavs = zip(
+        instances.uav_start[row].tolist(), instances.uav_end[row].tolist(), instances.uav_distance[row].tolist(), strict=True
+    )
+    scores = [
+        (sum(must[task] for task in members), math.fsum(values[task] for task in members))
+        for members in ([task for task in range(n_tasks) if tasks >> task & 1] for tasks in range(1 << n_tasks))
     ]
-    # Of every set of tasks, what it is worth to a UAV: nothing is feasible for one that has to visit it and cannot.
-    worth = {uav: _worth(points, prizes, service, *uav) for uav in set(fleet)}
-    best = worth[fleet[0]]
-    for uav in fleet[1:]:
-        own = worth[uav]
-        best = [max(best[tasks & ~mine] + own[mine] for mine in _subsets(tasks)) for tasks in range(1 << n_tasks)]
-    return max(best)
+    best: list[tuple[int, float]] | None = None
+    previous: list[tuple[int, float]] = []
+    for start, end, limit in uavs:
+        outward, homeward = ([math.hypot(x - site[0], y - site[1]) for x, y in points] for site in (start, end))
+        feasible = _feasible_sets(legs, outward, homeward, service, limit * (1 + DISTANCE_TOLERANCE))
+        own_scores = [score if fits else (0, 0.0) for score, fits in zip(scores, feasible, strict=True)]
+        if best is None:
+            best = [max(own_scores[own] for own in _subsets(tasks)) for tasks in range(1 << n_tasks)]
+            continue
+        previous = best
+        best = [
+            max(
+                (previous[tasks & ~own][0] + own_scores[own][0], previous[tasks & ~own][1] + own_scores[own][1])
+                for own in _subsets(tasks)
+            )
+            for tasks in range(1 << n_tasks)
+        ]
+    assert best is not None
+    return best[-1]
 
 
-def _worth(
-    points: Sequence[Point], prizes: Sequence[float], service: Sequence[float], start: Point, end: Point, limit: float
-) -> list[float]:
+def _feasible_sets(
+    legs: list[list[float]], outward: list[float], homeward: list[float], service: list[float], limit: float
+) -> list[bool]:
     """
-    :param points: The tasks
-    :param prizes: What each is worth
-    :param service: What serving each costs
-    :param start: Start of a UAV
-    :param end: Its end
-    :param limit: How far it flies
-    :return: What every set of tasks, as bits, is worth; -inf where the UAV cannot visit it. None at all is always allowed
+    :param legs: Distances between tasks
+    :param outward: Distances from the start to the tasks
+    :param homeward: Distances from the tasks to the end
+    :param service: What serving each task costs
+    :param limit: How far the UAV can fly
+    :return: Of every set of tasks, as bits, whether it can serve them all
     """
-    n_tasks = len(points)
-    # Of every set of tasks and its last one: the length of the shortest path from the start, with the services.
+    n_tasks = len(outward)
+    # Of every set of tasks and its last one: the length of the shortest path from the start, with what serving them costs.
     path = [[math.inf] * n_tasks for _ in range(1 << n_tasks)]
-    worth = [-math.inf] * (1 << n_tasks)
-    worth[0] = 0.0
+    feasible = [True] * (1 << n_tasks)
     for tasks in range(1, 1 << n_tasks):
         members = [task for task in range(n_tasks) if tasks >> task & 1]
         for last in members:
             rest = tasks & ~(1 << last)
-            before = [path[rest][task] + math.dist(points[task], points[last]) for task in members if task != last]
-            path[tasks][last] = min(before, default=math.dist(start, points[last])) + service[last]
-        if min(path[tasks][last] + math.dist(points[last], end) for last in members) <= limit:
-            worth[tasks] = math.fsum(prizes[task] for task in members)
-    return worth
+            before = [path[rest][task] + legs[task][last] for task in members if task != last]
+            path[tasks][last] = min(before, default=outward[last]) + service[last]
+        feasible[tasks] = min(path[tasks][last] + homeward[last] for last in members) <= limit
+    return feasible
 
 
 def _subsets(tasks: int) -> list[int]:

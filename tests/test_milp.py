@@ -121,7 +121,7 @@ def test_the_time_limit_is_kept_and_the_bound_holds() -> None:
 @pytest.mark.parametrize("n_tasks, n_uavs", [(1, 1), (1, 3), (4, 2), (7, 3), (30, 2), (20, 4), (16, 6)])
 def test_size_of_the_program(n_tasks: int, n_uavs: int) -> None:
     reduced = ReducedInstance.of(UniformGenerator(n_tasks, n_uavs, max_distance=9.0)(1, np.random.default_rng(0)))
-    program = _paper_program(_Places.of(reduced), n_uavs)
+    program = _paper_program(_Places.of(reduced))
     assert _program_size(n_tasks, n_uavs) == (len(program.objective), len(program.lower))
     assert len(program.starts) == len(program.lower) + 1 == len(program.upper) + 1
     assert program.starts[-1] == len(program.columns) == len(program.coefficients)

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from env_helpers import act, batched_env, both_levels, env_fns, legal_actions, make, play, rendered, reset
+from matplotlib.markers import MarkerStyle
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_uav.common.optional import install_command
 from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv
 from sb3_uav.envs.gym_env import ProblemEnv
-from sb3_uav.envs.render import MapFigure, legend_lines
+from sb3_uav.envs.problem import Stage
+from sb3_uav.envs.render import UAV_COLORS, MapFigure, legend_lines
 
 
 @both_levels
@@ -189,3 +191,115 @@ def test_large_fleets_are_drawn_and_twelve_uavs_named() -> None:
     axes = axes_of(env)
     box, page = axes.get_legend().get_window_extent(), axes.figure.bbox
     assert 0 <= box.x0 and box.x1 <= page.width and 0 <= box.y0 and box.y1 <= page.height
+
+
+# --------------------------------------------------------------------------------------------------------- the whole problem
+
+
+def whole_instance() -> Instances:
+    """Four UAVs: from the depot and back, from a start to an end, from a depot of its own, and one that cannot fly."""
+    return Instances.from_arrays(
+        [0.0, 0.0],
+        [[1, 0], [2, 0], [0, 3], [0, 4], [5, 5]],
+        None,
+        [4.0, 9.0, 8.0, 1.0],
+        4,
+        start=[[0, 0], [0, 1], [6, 6], [3, 3]],
+        end=[[0, 0], [0, 6], [6, 6], [90, 3]],
+        service=[0.5, 0.25, 0.0, 1.0, 0.0],
+        must_serve=[False, True, True, False, False],
+    )
+
+
+def drawn(instance: Instances, routes: list[list[int]], stage: Stage = Stage.FINISHED) -> Any:
+    figure = MapFigure()
+    figure.draw_routes(instance, routes, stage)
+    return figure.axes
+
+
+def marks(axes: Any) -> dict[tuple[float, float], list[tuple[str, tuple[int, ...]]]]:
+    """Of every place with something drawn at it: the outlines and colors of what is drawn there."""
+    found: dict[tuple[float, float], list[tuple[str, tuple[int, ...]]]] = {}
+    for artist in axes.collections:
+        color = (
+            tuple((255 * artist.get_facecolor()[0][:3]).round().astype(int).tolist()) if len(artist.get_facecolor()) else ()
+        )
+        outline = str(len(artist.get_paths()[0]))
+        for place in artist.get_offsets().tolist():
+            found.setdefault((place[0], place[1]), []).append((outline, color))
+    return found
+
+
+def outline_of(marker: str) -> str:
+    return str(len(MarkerStyle(marker).get_path()))
+
+
+def rgb(color: str) -> tuple[int, ...]:
+    return tuple(int(color[i : i + 2], 16) for i in (1, 3, 5))
+
+
+def test_starts_and_ends_are_marked_where_they_are_not_the_depot() -> None:
+    axes = drawn(whole_instance(), [[0], [2, 3], [], []])
+    at = marks(axes)
+    assert (outline_of(">"), rgb(UAV_COLORS[1])) in at[0.0, 1.0]
+    assert (outline_of("X"), rgb(UAV_COLORS[1])) in at[0.0, 6.0]
+    assert (outline_of("s"), rgb(UAV_COLORS[2])) in at[6.0, 6.0]
+    assert (outline_of(">"), rgb(UAV_COLORS[3])) in at[3.0, 3.0]
+    assert at[0.0, 0.0] == [(outline_of("s"), (0, 0, 0))]
+    lines = [np.stack(line.get_data(), axis=-1).tolist() for line in axes.get_lines()]
+    # Idle UAVs fly straight to their end, or stay.
+    assert lines == [[[0, 0], [1, 0], [0, 0]], [[0, 1], [0, 3], [0, 4], [0, 6]], [[6, 6], [6, 6]], [[3, 3]]]
+    assert max(axes.get_xlim()) < 10
+
+
+def test_legend_of_the_whole_problem() -> None:
+    """Lengths with service costs, of what each UAV can fly; tasks that must be served; and a place for every line."""
+    instance, routes = whole_instance(), [[0], [2, 3], [], []]
+    axes = drawn(instance, routes)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        "UAV 1: 1 task, length 2.50 of 4.00",
+        "UAV 2: 2 tasks, length 6.00 of 9.00",
+        "UAV 3: 0 tasks, length 0.00 of 8.00",
+        "UAV 4: 0 tasks, cannot reach its end",
+        "depot (D = 1.00 to 9.00)",
+        "start",
+        "end",
+        "start and end",
+        "2 tasks skipped",
+        "2 must be served, 1 skipped",
+    ]
+    assert legend_lines(routes, instance) == 5 and legend_lines(routes) == 3
+    flying = drawn(instance, [[0, 1]], Stage.FLYING)
+    assert flying.get_legend().get_texts()[0].get_text() == "UAV 1: 2 tasks, 1.25 left"
+
+
+def test_tasks_that_must_be_served_are_stars() -> None:
+    """Hollow and black where they are not, in the color of their UAV where they are."""
+    at = marks(drawn(whole_instance(), [[0], [2, 3], [], []]))
+    star, circle = outline_of("*"), outline_of("o")
+    assert at[0.0, 3.0] == [(star, rgb(UAV_COLORS[1]))]
+    assert at[2.0, 0.0] == [(star, ())]
+    assert at[0.0, 4.0] == [(circle, rgb(UAV_COLORS[1]))]
+    assert at[5.0, 5.0] == [(circle, ())]
+
+
+def test_the_legend_of_the_whole_problem_fits() -> None:
+    axes = drawn(whole_instance(), [[0], [2, 3], [], []])
+    axes.figure.canvas.draw()
+    box, page = axes.get_legend().get_window_extent(), axes.figure.bbox
+    assert 0 <= box.x0 and box.x1 <= page.width and 0 <= box.y0 and box.y1 <= page.height
+
+
+def test_an_episode_with_a_start_an_end_and_service() -> None:
+    """The tour of a running episode begins where the UAV is, and ends at its end."""
+    env = RoutePlanningEnv(n_tasks=2, max_distance=9.0)
+    instance = Instances.from_arrays([0, 0], [[0, 3], [0, 4]], None, 9.0, 1, start=[[0, 1]], end=[[0, 6]], service=[0.0, 1.0])
+    env.reset(options={"instance": instance})
+    env.step(1)
+    assert legend_of(env)[0] == "UAV 1: 1 task, 7.00 left"
+    env.step(2)
+    assert legend_of(env)[0] == "UAV 1: 2 tasks, 5.00 left"
+    assert lines_of(env) == [[[0.0, 1.0], [0.0, 3.0], [0.0, 4.0]]]
+    env.step(0)
+    assert legend_of(env)[0] == "UAV 1: 2 tasks, length 6.00"
+    assert lines_of(env) == [[[0.0, 1.0], [0.0, 3.0], [0.0, 4.0], [0.0, 6.0]]]

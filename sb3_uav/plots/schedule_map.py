@@ -35,7 +35,8 @@ class MapPanel(NamedTuple):
 
 def plot_schedule(instances: Instances, row: int, schedule: Schedule, path: str | os.PathLike[str], title: str = "") -> None:
     """
-    Draw one schedule: the depot, tours colored by UAV, skipped tasks hollow, counts and lengths in the legend.
+    Draw one schedule: the depot, tours colored by UAV, skipped tasks hollow, tasks that must be served as stars, counts and
+    lengths in the legend.
 
     :param instances: The instances
     :param row: Index of the instance
@@ -73,11 +74,13 @@ def schedules_figure(panels: Sequence[MapPanel], n_columns: int = _MAX_COLUMNS) 
         raise ValueError("There is nothing to draw: give at least one panel.")
     n_columns = min(len(panels), n_columns)
     n_lines = math.ceil(len(panels) / n_columns)
-    height = PANEL_HEIGHT + _LEGEND_LINE_HEIGHT * max(legend_lines(panel.schedule.routes) for panel in panels)
+    maps = [panel.instances[panel.row].to("cpu") for panel in panels]
+    lines = max(legend_lines(panel.schedule.routes, instance) for panel, instance in zip(panels, maps, strict=True))
+    height = PANEL_HEIGHT + _LEGEND_LINE_HEIGHT * lines
     figure = new_figure(_PANEL_WIDTH * n_columns, height * n_lines)
     grid = figure.subplots(n_lines, n_columns, squeeze=False).flatten()
-    for axes, panel in zip(grid, panels, strict=False):
-        draw_map(axes, panel.instances[panel.row].to("cpu"), 0, panel.schedule.routes, panel.title)
+    for axes, panel, instance in zip(grid, panels, maps, strict=False):
+        draw_map(axes, instance, 0, panel.schedule.routes, panel.title)
         # Extra vertical space goes to the legend.
         axes.set_anchor("N")
     for axes in grid[len(panels) :]:

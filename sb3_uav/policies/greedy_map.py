@@ -34,6 +34,6 @@ def greedy_map(policy: EpisodicPolicy, problem: Problem, instance: Instances) ->
     finally:
         policy.set_training_mode(was_training)
     figure = MapFigure()
-    total = float(instance.values[instance.task_mask].sum())
+    total = float(instance.prizes[instance.task_mask].sum())
     figure.draw_routes(arranged, routes, Stage.FINISHED, f"greedy: objective {objective:g} of {total:g}")
     return figure.rgb_array()

@@ -1,10 +1,16 @@
-"""K-means clustering of points in the plane."""
+"""K-means clustering of points in the plane, and a cluster of tasks for every UAV."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from sb3_uav.envs.distances import euclidean
+from sb3_uav.envs.instances import Instances
+from sb3_uav.solvers.matching import cheapest_assignment
+
 _MAX_LLOYD_ITERATIONS = 100
+# In units of what the UAV that flies farthest can fly.
+_LEAST_RANGE = 1e-9
 
 
 def checked_restarts(restarts: int, solver: str) -> int:
@@ -17,6 +23,34 @@ def checked_restarts(restarts: int, solver: str) -> int:
     if restarts < 1:
         raise ValueError(f"restarts of {solver} is {restarts}; K-means needs at least 1 start.")
     return restarts
+
+
+def clusters_of_uavs(instance: Instances, rng: np.random.Generator, restarts: int = 10) -> np.ndarray:
+    """
+    A cluster of tasks for every UAV.
+
+    Of UAVs that differ, those that can serve no task get none, and the others the clusters whose centers are the least detour
+    for them, in parts of what they can fly, added up over the fleet.
+
+    :param instance: A batch of one on the CPU, without padding
+    :param rng: The source of randomness
+    :param restarts: Number of starts of K-means
+    :return: ``(n_tasks,)`` int64, the UAV of each task
+    """
+    points = instance.tasks[0].numpy()
+    if instance.has_equal_uavs:
+        return kmeans(points, instance.n_uavs, rng, restarts)
+    useful = np.flatnonzero(instance.reachable_by_uav()[0].any(1).numpy())
+    if len(useful) == 0:
+        return np.zeros(len(points), np.int64)
+    clusters = kmeans(points, len(useful), rng, restarts)
+    costs = np.zeros((len(useful), len(useful)))
+    for cluster in np.unique(clusters):
+        center = instance.tasks[0, clusters == cluster].mean(0)
+        flown = euclidean(instance.uav_start[0], center) + euclidean(center, instance.uav_end[0])
+        # A UAV with nothing to fly is useful where it is.
+        costs[cluster] = (flown / instance.uav_distance[0].clamp(min=_LEAST_RANGE * float(instance.unit[0])))[useful]
+    return useful[cheapest_assignment(costs)][clusters]
 
 
 def kmeans(points: np.ndarray, n_clusters: int, rng: np.random.Generator, restarts: int = 10) -> np.ndarray:

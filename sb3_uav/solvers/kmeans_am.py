@@ -14,7 +14,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.loading import load_policy
-from sb3_uav.solvers.kmeans import checked_restarts, kmeans
+from sb3_uav.solvers.kmeans import checked_restarts, clusters_of_uavs
 from sb3_uav.solvers.network_solver import BatchedSolver, parameters_hash
 
 
@@ -61,8 +61,7 @@ def kmeans_assignment(instances: Instances, rows: Sequence[int], seed: int, rest
     assignment = th.full((len(rows), 1, instances.n_tasks), UNASSIGNED, device=instances.device)
     for i, (row, n_tasks) in enumerate(zip(rows, instances.task_mask.sum(1).tolist(), strict=True)):
         if n_tasks > 0:
-            points = instances.tasks[i, :n_tasks].numpy()
-            clusters = kmeans(points, instances.n_uavs, keyed_generator(seed, row), restarts)
+            clusters = clusters_of_uavs(instances[i].trim(n_tasks), keyed_generator(seed, row), restarts)
             assignment[i, 0, :n_tasks] = th.from_numpy(clusters)
     return assignment
 

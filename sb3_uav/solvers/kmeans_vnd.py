@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import torch as th
 
 from sb3_uav.common.optional import require
+from sb3_uav.envs.allocation import Subsets, split_tasks
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.kmeans import checked_restarts, kmeans
+from sb3_uav.solvers.kmeans import checked_restarts, clusters_of_uavs
 from sb3_uav.solvers.nearest_task import nearest_feasible_schedule
 
 
@@ -29,6 +30,7 @@ class KMeansVND(OneByOneSolver):
     """
 
     name = "kmeans-vnd"
+    solves_whole_problem = True
     uses_time_limit = False
 
     def __init__(self, restarts: int = 10) -> None:
@@ -39,9 +41,10 @@ class KMeansVND(OneByOneSolver):
         _warm_up()
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
-        clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
+        clusters = clusters_of_uavs(instance, rng, self.restarts)
         start = nearest_feasible_schedule(instance, clusters)
-        return Solution(Schedule(_descend(instance, clusters == uav, route) for uav, route in enumerate(start.routes)))
+        subsets = split_tasks(instance, th.from_numpy(clusters)[None, None])
+        return Solution(Schedule(_descend(subsets, uav, route) for uav, route in enumerate(start.routes)))
 
 
 @cache
@@ -52,25 +55,21 @@ def _warm_up() -> None:
     warm_up()
 
 
-def _descend(instance: Instances, mine: np.ndarray, route: tuple[int, ...]) -> tuple[int, ...]:
+def _descend(subsets: Subsets, uav: int, route: tuple[int, ...]) -> tuple[int, ...]:
     """
-    :param instance: A batch of one
-    :param mine: ``(n_tasks,)`` bool, the tasks that the UAV may visit
-    :param route: Some of them, in flying order
+    :param subsets: The tasks that every UAV may visit
+    :param uav: One of them
+    :param route: Some of its tasks, in flying order
     :return: A better route over them
     """
-    tasks = np.flatnonzero(mine)
-    if len(tasks) == 0:
+    alone = subsets.instances[uav]
+    n_tasks = int(alone.task_mask.sum())
+    if n_tasks == 0:
         return ()
     from sb3_uav.local_search.search import LocalSearch
 
-    alone = replace(
-        instance,
-        tasks=instance.tasks[:, tasks],
-        values=instance.values[:, tasks],
-        task_mask=instance.task_mask[:, tasks],
-        n_uavs=1,
-    )
+    # In ascending order, see split_tasks.
+    tasks = subsets.task_index[uav, :n_tasks].numpy()
     start = Schedule([np.searchsorted(tasks, route)])
-    found = LocalSearch(alone).repair(start, max_string=0)
+    found = LocalSearch(alone.trim(n_tasks)).repair(start, max_string=0)
     return tuple(tasks[list(found.routes[0])].tolist())

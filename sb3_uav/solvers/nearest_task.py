@@ -10,7 +10,7 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import nearest_feasible
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
-from sb3_uav.solvers.kmeans import checked_restarts, kmeans
+from sb3_uav.solvers.kmeans import checked_restarts, clusters_of_uavs
 
 
 def nearest_feasible_schedule(instance: Instances, assignment: np.ndarray) -> Schedule:
@@ -50,5 +50,4 @@ class KMeansNearest(OneByOneSolver):
         self.restarts = checked_restarts(restarts, self.name)
 
     def solve_one(self, instance: Instances, time_limit: float | None, rng: np.random.Generator) -> Solution:
-        clusters = kmeans(instance.tasks[0].numpy(), instance.n_uavs, rng, self.restarts)
-        return Solution(nearest_feasible_schedule(instance, clusters))
+        return Solution(nearest_feasible_schedule(instance, clusters_of_uavs(instance, rng, self.restarts)))

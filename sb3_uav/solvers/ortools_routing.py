@@ -10,12 +10,12 @@ import numpy as np
 
 from sb3_uav.common.optional import require
 from sb3_uav.envs.instances import Instances
-from sb3_uav.envs.reduction import FINE_RESOLUTION, ReducedInstance
+from sb3_uav.envs.reduction import ReducedInstance
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.solvers.base import OneByOneSolver, Solution
 from sb3_uav.solvers.limits import TimeLimitedSolver
 
-# Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
+# Prizes of tasks whose values are rounded are whole multiples of the smallest that outweighs all distances; this many at most.
 _LARGEST_PRIZE = 1_000_000
 # More than any move of the local search takes.
 _SECONDS_PER_MOVE = 86_400
@@ -35,6 +35,7 @@ class ORTools(OneByOneSolver):
     """
 
     name = "ortools"
+    solves_whole_problem = True
     uses_time_limit = False
 
     def __init__(self) -> None:
@@ -56,6 +57,7 @@ class ORToolsGLS(TimeLimitedSolver):
     """
 
     name = "ortools-gls"
+    solves_whole_problem = True
 
     def __init__(self, time_limit: float = 10.0) -> None:
         super().__init__(time_limit)
@@ -86,12 +88,14 @@ def _solve(solver: str, instance: Instances, deadline: float | None = None) -> S
     reduced = ReducedInstance.of(instance)
     if reduced.n_tasks == 0:
         return reduced.schedule([])
-    manager = pywrapcp.RoutingIndexManager(reduced.n_tasks + 1, reduced.n_uavs, 0)
+    starts, ends = ([getattr(uav, place) for uav in reduced.uavs] for place in ("start", "end"))
+    manager = pywrapcp.RoutingIndexManager(len(reduced.distances), reduced.n_uavs, starts, ends)
     routing = pywrapcp.RoutingModel(manager)
     routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(reduced.arc_costs().tolist()))
     flown = routing.RegisterTransitMatrix(reduced.fine_distances().tolist())
-    routing.AddDimension(flown, 0, FINE_RESOLUTION, True, "distance")
-    for node, penalty in enumerate(reduced.integer_prizes(_LARGEST_PRIZE, LARGEST_COST).tolist(), start=1):
+    routing.AddDimensionWithVehicleCapacity(flown, 0, reduced.fine_limits().tolist(), True, "distance")
+    prizes = reduced.integer_prizes(_LARGEST_PRIZE, LARGEST_COST).tolist()
+    for node, penalty in enumerate(prizes, start=reduced.n_sites):
         routing.AddDisjunction([manager.NodeToIndex(node)], penalty)
     solution = routing.SolveWithParameters(_search_parameters(pywrapcp, deadline))
     if solution is None and deadline is not None:

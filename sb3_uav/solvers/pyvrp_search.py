@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -20,7 +21,7 @@ from sb3_uav.solvers.overlong_tours import with_feasible_tours
 # Its interface changes with every minor version.
 _SUPPORTED_VERSION = "0.14."
 _NUM_NEIGHBOURS = 20
-# Prizes of tasks are whole multiples of the smallest that outweighs all distances; this many at most.
+# Prizes of tasks whose values are rounded are whole multiples of the smallest that outweighs all distances; this many at most.
 _LARGEST_PRIZE = 100_000
 # How far PyVRP may raise the cost of tours that are too long: for an excess of the maximum flight distance, to so many times
 # the largest prize. Its own bound, per unit of distance, suffices for equal values; it is far too low for prizes that differ
@@ -43,6 +44,7 @@ class PyVRP(TimeLimitedSolver):
     """
 
     name = "pyvrp"
+    solves_whole_problem = True
 
     def __init__(self, time_limit: float = 10.0, num_neighbours: int = _NUM_NEIGHBOURS) -> None:
         super().__init__(time_limit)
@@ -101,7 +103,7 @@ def _require_pyvrp(solver: str) -> Any:
 
 
 def _total_value(instance: Instances, schedule: Schedule) -> float:
-    values = instance.values[0].tolist()
+    values = instance.prizes[0].tolist()
     return sum(values[task] for route in schedule.routes for task in route)
 
 
@@ -140,12 +142,35 @@ def _search(instance: Instances, initial: Schedule | None, deadline: float, seed
             seed,
             collect_stats=False,
             params=params,
-            initial_solution=None
-            if initial is None
-            else pyvrp.Solution(data, [[node - 1 for node in route] for route in reduced.routes(initial)]),
+            initial_solution=None if initial is None else _solution(pyvrp, data, reduced, reduced.routes(initial)),
         ).best
-    routes = [[activity.idx + 1 for activity in route if activity.is_client()] for route in best.routes()]
-    return reduced.schedule(with_feasible_tours(reduced, routes))
+    return reduced.schedule(with_feasible_tours(reduced, _routes(reduced, best)))
+
+
+def _solution(pyvrp: Any, data: Any, reduced: ReducedInstance, routes: Sequence[Sequence[int]]) -> Any:
+    """
+    :param pyvrp: The module
+    :param data: PyVRP's description of what to plan
+    :param reduced: What to plan
+    :param routes: Routes of UAV after UAV, as nodes
+    :return: PyVRP's description of these routes
+    """
+    kind_of = [kind for kind, uavs in enumerate(reduced.uavs_of_kinds()) for _ in uavs]
+    visits = [([node - reduced.n_sites for node in route], kind) for route, kind in zip(routes, kind_of, strict=False)]
+    return pyvrp.Solution(data, [pyvrp.Route(data, clients, kind) for clients, kind in visits if clients])
+
+
+def _routes(reduced: ReducedInstance, solution: Any) -> list[list[int]]:
+    """
+    :param reduced: What is planned
+    :param solution: PyVRP's solution
+    :return: Its routes as nodes, of UAV after UAV; trailing empty routes are left out
+    """
+    flown: list[list[list[int]]] = [[] for _ in reduced.kinds]
+    for route in solution.routes():
+        clients = [activity.idx for activity in route if activity.is_client()]
+        flown[route.vehicle_type()].append([client + reduced.n_sites for client in clients])
+    return reduced.of_kinds(flown)
 
 
 def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> Any:
@@ -153,15 +178,25 @@ def _problem_data(pyvrp: Any, reduced: ReducedInstance, prizes: np.ndarray) -> A
     :param pyvrp: The module
     :param reduced: What to plan
     :param prizes: ``(n,)`` int64
-    :return: PyVRP's description of it; client ``i`` is node ``i + 1``
+    :return: PyVRP's description of it; depot ``i`` is node ``i``, client ``i`` is node
+        ``n_sites + i``, and vehicle type ``i`` is kind ``i``
     """
     distances = reduced.coarse_distances()
+    n_sites = reduced.n_sites
     return pyvrp.ProblemData(
         # All distances are in the matrix.
         locations=[pyvrp.Location(0, 0)] * len(distances),
-        clients=[pyvrp.Client(node, prize=prize, required=False) for node, prize in enumerate(prizes.tolist(), start=1)],
-        depots=[pyvrp.Depot(0)],
-        vehicle_types=[pyvrp.VehicleType(num_available=reduced.n_uavs, max_distance=RESOLUTION)],
+        clients=[pyvrp.Client(node, prize=prize, required=False) for node, prize in enumerate(prizes.tolist(), start=n_sites)],
+        depots=[pyvrp.Depot(site) for site in range(n_sites)],
+        vehicle_types=[
+            pyvrp.VehicleType(
+                num_available=len(uavs),
+                start_depot=kind.start,
+                end_depot=kind.end,
+                max_distance=reduced.coarse_limit(kind),
+            )
+            for kind, uavs in zip(reduced.kinds, reduced.uavs_of_kinds(), strict=True)
+        ],
         distance_matrices=[distances],
         duration_matrices=[np.zeros_like(distances)],
     )
