@@ -30,7 +30,7 @@ from sb3_uav.solvers.pyvrp_search import polish_schedule
 
 pytestmark = pytest.mark.usefixtures("ticks")
 
-CLASSICAL = (*ALL, "kmeans-vnd", "kmeans-nearest", "random-nearest")
+CLASSICAL = (*ALL, "local-search:time_limit=0.05", "kmeans-vnd", "kmeans-nearest", "random-nearest")
 # These find the best schedule of a handful of tasks by hand.
 SEARCHES = ("milp", "ortools", "ortools-gls:time_limit=0.05", *(["pyvrp:time_limit=0.3"] if HAS_PYVRP else []))
 

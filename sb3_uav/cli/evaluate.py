@@ -88,6 +88,22 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _warn_of_tasks_out_of_reach(name: str, instances: Instances) -> None:
+    """Say on stderr how many tasks no UAV can serve, and name those that must be served."""
+    reachable = instances.reachable()
+    n_real, n_reachable = int(instances.task_mask.sum()), int(reachable.sum())
+    if n_reachable == n_real:
+        return
+    why = "lie farther than max_distance / 2 from their depot" if instances.is_plain else "are out of reach of every UAV"
+    print(f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks {why}; no schedule can visit them.", file=sys.stderr)
+    if instances.must_serve is None:
+        return
+    lost = instances.must_serve & instances.task_mask & ~reachable
+    for row in lost.any(1).nonzero()[:, 0].tolist():
+        tasks = ", ".join(str(task) for task in lost[row].nonzero()[:, 0].tolist())
+        print(f"sb3-uav: {name}: instance {row}: tasks that must be served are among them: {tasks}.", file=sys.stderr)
+
+
 def _load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
     """
     :param paths: The files
@@ -196,13 +212,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     require_rich()
     instances = _load_instances(args.instances)
     for name, batch in instances.items():
-        n_real, n_reachable = int(batch.task_mask.sum()), int(batch.reachable().sum())
-        if n_reachable < n_real:
-            print(
-                f"sb3-uav: {name}: {n_real - n_reachable} of {n_real} tasks lie farther than max_distance / 2 from their "
-                "depot; no schedule can visit them.",
-                file=sys.stderr,
-            )
+        _warn_of_tasks_out_of_reach(name, batch)
     solvers = _make_solvers(args)
     reference = find_reference(solvers, args.reference)
     try:

@@ -114,15 +114,16 @@ def schedule_to_json(solver: str, row: int, schedule: Schedule, report: Schedule
     :param row: Index of the instance
     :param schedule: The schedule
     :param report: The result of :func:`check_schedule`
-    :return: The fields of one line of a ``schedules.jsonl``
+    :return: The fields of one line of a ``schedules.jsonl``; ``unserved`` only if a task that must be served is not
     """
-    return {
+    record = {
         "solver": solver,
         "instance": row,
         "routes": [list(route) for route in schedule.routes],
         "objective": report.objective,
         "lengths": list(report.lengths),
     }
+    return {**record, "unserved": list(report.unserved)} if report.unserved else record
 
 
 def _schedule_from_json(record: Any, source: str) -> tuple[str, int, Schedule]:

@@ -21,6 +21,7 @@ SOLVERS: dict[str, str] = {
     # Any other zip of SB3, on the step loop of its environment.
     "sb3": "sb3_uav.solvers.sb3_zip:load_sb3",
     "greedy-insertion": "sb3_uav.solvers.insertion:GreedyInsertion",
+    "local-search": "sb3_uav.solvers.local_search:LocalSearchSolver",
     "milp": "sb3_uav.solvers.milp:MILP",
     "ortools": "sb3_uav.solvers.ortools_routing:ORTools",
     "ortools-gls": "sb3_uav.solvers.ortools_routing:ORToolsGLS",
