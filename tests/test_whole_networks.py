@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from policy_helpers import make_policy as make_plain_policy
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_uav.envs import Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator, check_schedule
+from sb3_uav.envs import FixedGenerator, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator, check_schedule
 from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.problem import WHOLE_KEYS
 from sb3_uav.solvers.dl_drl import DLDRL
@@ -189,3 +189,39 @@ def test_observations_show_the_whole_problem_where_there_is_more() -> None:
 def test_whole_needs_its_ingredients() -> None:
     with pytest.raises(ValueError, match="whole=True needs geometry=True"):
         make_plain_policy("router", preset="whole", geometry=False)
+
+
+@pytest.mark.parametrize("env_class", [TaskAllocationEnv, RoutePlanningEnv])
+def test_a_later_generator_may_be_of_the_papers_problem(env_class: Any) -> None:
+    """The observation stays what the space says."""
+    env = env_class(instances=fleet(1))
+    env.problem.set_generator(UniformGenerator(9, 3))
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    env.problem.set_generator(FixedGenerator(fleet(1)))
+    assert env.reset(seed=0)[0] in env.observation_space
+
+
+@levels
+@pytest.mark.parametrize("change", ["range", "far end", "far start"])
+def test_logits_are_finite_whatever_a_fleet_is_like(level: str, change: str) -> None:
+    """The first UAV cannot fly, or another one is out of this world; both drivers."""
+    instances = fleet(4)
+    if change == "range":
+        ranges = instances.max_distance.clone()
+        ranges[:, 0] = 0.0
+        instances = replace(instances, max_distance=ranges)
+    else:
+        name = change.split()[1]
+        sites = getattr(instances, name).clone()
+        sites[:, 0 if level == "router" else 1] *= 1e25
+        instances = replace(instances, **{name: sites})
+    env = (TaskAllocationEnv if level == "allocator" else RoutePlanningEnv)(generator=FixedGenerator(instances))
+    if level == "router":
+        instances = instances.with_fleet(1)
+    policy = make_policy(level, "whole", instances.n_tasks, instances.n_uavs, True)
+    evaluation = policy.evaluate_episodes(instances, sample(policy, instances, 2, 0))
+    assert evaluation.log_prob.isfinite().all()
+    tensor: Any = obs_as_tensor({key: value[None] for key, value in env.reset(seed=0)[0].items()}, th.device("cpu"))
+    with th.no_grad():
+        assert not policy.masked_logits(tensor).isnan().any()

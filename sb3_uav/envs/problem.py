@@ -103,6 +103,8 @@ class Problem(ABC):
 
     def __init__(self, generator: InstanceGenerator, reward: Reward | None = None) -> None:
         self.generator = generator
+        # Once and for all, as the observation space: later generators may be of the paper's problem.
+        self.is_whole = goes_beyond_the_paper(generator)
         self.reward = reward
         self.action_space = self._action_space()
         self.observation_space = spaces.Dict({**self._static_spaces(), **self._dynamic_spaces()})
@@ -115,7 +117,7 @@ class Problem(ABC):
         :raises ValueError: If its instances do not fit the observation space
         """
         old, new = self.generator, generator
-        if goes_beyond_the_paper(new) and not goes_beyond_the_paper(old):
+        if goes_beyond_the_paper(new) and not self.is_whole:
             raise ValueError(
                 "The new generator goes beyond the paper's problem (starts, ends, distances or service costs), which the "
                 "observations of this environment do not show; make a new environment."
@@ -154,11 +156,6 @@ class Problem(ABC):
             "uav_distance": spaces.Box(0.0, np.inf, (n_uavs,), np.float32),
             "service": spaces.Box(0.0, np.inf, (n_tasks,), np.float32),
         }
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether observations show what goes beyond the paper's problem: starts, ends, distances and service costs."""
-        return goes_beyond_the_paper(self.generator)
 
     @abstractmethod
     def dynamics(self, instances: Instances) -> Dynamics:

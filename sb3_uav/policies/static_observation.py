@@ -41,7 +41,9 @@ class StaticObservation(NamedTuple):
     def from_observation(cls, observation: TensorDict) -> StaticObservation:
         """:param observation: A batch of preprocessed observations"""
         whole = {}
+        unit = observation["max_distance"]
         if "uav_distance" in observation:
+            unit = _unit(unit)
             whole = {
                 "start": observation["uav_start"].unflatten(1, (-1, 2)),
                 "end": observation["uav_end"].unflatten(1, (-1, 2)),
@@ -53,7 +55,7 @@ class StaticObservation(NamedTuple):
             tasks=observation["tasks"].unflatten(1, (-1, 2)),
             values=observation["task_values"],
             task_mask=observation["task_mask"].bool(),
-            max_distance=observation["max_distance"],
+            max_distance=unit,
             **whole,
         )
 
@@ -61,14 +63,12 @@ class StaticObservation(NamedTuple):
     def from_instances(cls, instances: Instances) -> StaticObservation:
         """:param instances: Instances on the network's device"""
         instances = instances.near_origin()
-        # That of a single UAV may be 0, and is a unit.
-        unit = instances.unit.float()[:, None]
         return cls(
             depot=instances.depot.float(),
             tasks=instances.tasks.float(),
             values=instances.prizes.float(),
             task_mask=instances.task_mask,
-            max_distance=unit.where(unit > 0, 1.0),
+            max_distance=_unit(instances.unit.float()[:, None]),
             start=None if instances.start is None else instances.start.float(),
             end=None if instances.end is None else instances.end.float(),
             uav_distance=None if instances.max_distance.dim() == 1 else instances.max_distance.float(),
@@ -82,3 +82,8 @@ class StaticObservation(NamedTuple):
             return self.depot
         # Exact where all are equal.
         return self.end[:, 0] + (self.end - self.end[:, :1]).mean(1)
+
+
+def _unit(max_distance: th.Tensor) -> th.Tensor:
+    """:return: The same as a unit of length: that of a single UAV may be 0, which stands for 1 then"""
+    return max_distance.where(max_distance > 0, 1.0)

@@ -11,6 +11,8 @@ from sb3_uav.policies.static_observation import StaticObservation
 
 # Logarithms of ratios of values are limited to this: a factor of 400.
 _LOG_VALUE_LIMIT = 6.0
+# Where UAVs start and end is limited to so many units: squares of distances must be finite.
+_FARTHEST_SITE = 1e6
 # A solo flight longer than so many times the maximum distance is as impossible as any.
 LONGEST_SOLO = 2.0
 # Values are compared with the mean of the instance's tasks; this keeps the quotient finite where all are 0.
@@ -51,8 +53,8 @@ class World(NamedTuple):
         value = values / mean.clamp(min=_SMALLEST)
         log_value = value.clamp(min=_SMALLEST).log().clamp(-_LOG_VALUE_LIMIT, _LOG_VALUE_LIMIT)
         return cls(
-            start=(start - home) / unit[..., None],
-            end=(end - home) / unit[..., None],
+            start=((start - home) / unit[..., None]).clamp(-_FARTHEST_SITE, _FARTHEST_SITE),
+            end=((end - home) / unit[..., None]).clamp(-_FARTHEST_SITE, _FARTHEST_SITE),
             reach=th.ones_like(unit) if static.uav_distance is None else static.uav_distance / unit,
             service=service.masked_fill(~real, 0.0).clamp(max=LONGEST_SOLO),
             value=value,
