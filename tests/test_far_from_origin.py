@@ -72,3 +72,15 @@ def test_padding_is_no_task_far_from_the_origin() -> None:
     """Padded slots remain at the depot."""
     shown = field((1e7, 1e7), n_tasks=3).pad(5).near_origin()
     assert (shown.depot == 0).all() and (shown.tasks[:, 3:] == 0).all() and not shown.task_mask[:, 3:].any()
+
+
+def test_the_depot_means_nothing_where_uavs_have_places_of_their_own() -> None:
+    """Networks see as much of the field wherever that lies."""
+    rng = np.random.default_rng(0)
+    tasks, start, end = rng.random((9, 2)), rng.random((2, 2)), rng.random((2, 2))
+    shown = []
+    for offset in (0.0, 2.0**23):
+        moved = Instances.from_arrays([0, 0], tasks + offset, None, 1.0, 2, start=start + offset, end=end + offset)
+        static = StaticObservation.from_instances(moved)
+        shown.append(static.tasks - static.home[:, None])
+    assert th.allclose(shown[0], shown[1], atol=1e-6)

@@ -14,7 +14,7 @@ from matplotlib.markers import MarkerStyle
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_uav.common.optional import install_command
-from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv
+from sb3_uav.envs import BatchedVecEnv, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
 from sb3_uav.envs.gym_env import ProblemEnv
 from sb3_uav.envs.problem import Stage
 from sb3_uav.envs.render import UAV_COLORS, MapFigure, legend_lines
@@ -292,9 +292,9 @@ def test_the_legend_of_the_whole_problem_fits() -> None:
 
 def test_an_episode_with_a_start_an_end_and_service() -> None:
     """The tour of a running episode begins where the UAV is, and ends at its end."""
-    env = RoutePlanningEnv(n_tasks=2, max_distance=9.0)
     instance = Instances.from_arrays([0, 0], [[0, 3], [0, 4]], None, 9.0, 1, start=[[0, 1]], end=[[0, 6]], service=[0.0, 1.0])
-    env.reset(options={"instance": instance})
+    env = RoutePlanningEnv(instances=instance)
+    env.reset()
     env.step(1)
     assert legend_of(env)[0] == "UAV 1: 1 task, 7.00 left"
     env.step(2)
@@ -303,3 +303,9 @@ def test_an_episode_with_a_start_an_end_and_service() -> None:
     env.step(0)
     assert legend_of(env)[0] == "UAV 1: 2 tasks, length 6.00"
     assert lines_of(env) == [[[0.0, 1.0], [0.0, 3.0], [0.0, 4.0], [0.0, 6.0]]]
+
+
+def test_a_schedule_with_too_many_routes_is_drawn() -> None:
+    """Whoever looks at it wants to see what is wrong."""
+    axes = drawn(UniformGenerator(5, 2)(1, np.random.default_rng(0)), [[0], [1], [2]])
+    assert axes.get_legend().get_texts()[2].get_text().startswith("UAV 3: 1 task, length")

@@ -211,3 +211,13 @@ def test_compaction_keeps_what_is_kept(seed: int) -> None:
         assert index[row, : len(tasks)].tolist() == tasks.tolist() and int(compacted.task_mask[row].sum()) == len(tasks)
         assert th.equal(compacted.tasks[row, : len(tasks)], drawn.tasks[row, tasks])
         assert th.equal(compacted.service_cost[row, : len(tasks)], drawn.service_cost[row, tasks])
+        padded = ~compacted.task_mask[row]
+        assert (compacted.service_cost[row, padded] == 0).all()
+
+
+def test_compaction_leaves_padding_empty() -> None:
+    """As padding that was never a task."""
+    drawn = Instances.from_arrays([0, 0], [[1, 0], [2, 0], [3, 0]], service=[0.1, 0.2, 0.3], must_serve=[True, True, True])
+    both = Instances.concatenate([drawn, drawn])
+    compacted, _ = compact(both, th.tensor([[True, True, False], [True, False, False]]))
+    assert compacted[1].digest() == drawn.trim(1).pad(2).digest()

@@ -28,5 +28,7 @@ def compact(instances: Instances, kept: th.Tensor) -> tuple[Instances, th.Tensor
         arranged,
         tasks=th.where(padded[..., None], arranged.depot[:, None], arranged.tasks),
         values=arranged.values.masked_fill(padded, 0.0),
+        service=None if arranged.service is None else arranged.service.masked_fill(padded, 0.0),
+        must_serve=None if arranged.must_serve is None else arranged.must_serve & ~padded,
     )
     return compacted, index[:, :n_slots]

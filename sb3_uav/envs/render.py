@@ -176,7 +176,9 @@ class Flight(NamedTuple):
         :param route: Its tasks
         :return: Its flight
         """
-        start, end, maximum = (of_uav[0, uav] for of_uav in (instance.uav_start, instance.uav_end, instance.uav_distance))
+        # A faulty schedule, with more routes than UAVs, is drawn too.
+        row = min(uav, instance.n_uavs - 1)
+        start, end, maximum = (of_uav[0, row] for of_uav in (instance.uav_start, instance.uav_end, instance.uav_distance))
         tasks = list(route)
         service = 0.0 if instance.service is None else float(instance.service[0, tasks].sum())
         points = instance.tasks[0].numpy()[tasks]
