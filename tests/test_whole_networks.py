@@ -16,9 +16,17 @@ from policy_helpers import make_policy as make_plain_policy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_uav.envs import FixedGenerator, Instances, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator, check_schedule
-from sb3_uav.envs.allocation import plan_tours, schedules
+from sb3_uav.envs.allocation import allowed_uavs, plan_tours, schedules
 from sb3_uav.envs.problem import WHOLE_KEYS
+from sb3_uav.envs.sweep import sweep_order
+from sb3_uav.policies import AllocatorPolicy
+from sb3_uav.policies.fleet_geometry import FleetFeature, FleetGeometry
+from sb3_uav.policies.geometry import FAR_SCALE
+from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
+from sb3_uav.policies.static_observation import StaticObservation
+from sb3_uav.policies.world import World
 from sb3_uav.solvers.dl_drl import DLDRL
+from sb3_uav.studies.compare.fixed_router import _DividedSubsets
 
 levels = pytest.mark.parametrize("level", ["allocator", "router"])
 
@@ -162,6 +170,9 @@ def test_networks_of_the_paper_refuse_the_rest(level: str) -> None:
         policy = make_plain_policy(level, preset=preset)
         with pytest.raises(ValueError, match=r"sees only the paper's problem, but the instances have .*start.*preset='whole'"):
             policy.decode_episodes(instances)
+        if isinstance(policy, AllocatorPolicy):
+            with pytest.raises(ValueError, match="sees only the paper's problem"):
+                policy.encode_nodes(instances)
         env = make_env(level, instances)
         with pytest.raises(ValueError, match="would not see; use preset='whole'"):
             type(policy)(env.observation_space, env.action_space, lambda _: 0.0, preset=preset)
@@ -225,3 +236,55 @@ def test_logits_are_finite_whatever_a_fleet_is_like(level: str, change: str) -> 
     tensor: Any = obs_as_tensor({key: value[None] for key, value in env.reset(seed=0)[0].items()}, th.device("cpu"))
     with th.no_grad():
         assert not policy.masked_logits(tensor).isnan().any()
+
+
+def test_the_router_of_a_comparison_learns_the_whole_problem() -> None:
+    env = RoutePlanningEnv(generator=_DividedSubsets(FixedGenerator(fleet())))
+    assert env.reset(seed=0)[0] in env.observation_space and env.problem.is_whole
+
+
+# ---------------------------------------------------------------------------------------------------------------- by hand
+
+
+def two_uavs() -> Instances:
+    """One flies from 10 to 14 and 8 far, the other from 10 to 10 and 4 far; the depot is elsewhere."""
+    return Instances.from_arrays(
+        [0, 0], [[12, 0], [11, 0], [8, 0], [99, 0]], None, [8, 4], 2, start=[[10, 0], [10, 0]], end=[[14, 0], [10, 0]]
+    )
+
+
+def test_a_uav_gets_no_task_that_it_cannot_serve() -> None:
+    """Unless none can, because somebody has to get it."""
+    allowed = allowed_uavs(two_uavs())
+    assert allowed is not None and allowed[0].tolist() == [[True, True], [True, True], [True, True], [True, True]]
+    short = allowed_uavs(replace(two_uavs(), max_distance=th.tensor([[8.0, 1.0]], dtype=th.float64)))
+    assert short is not None and short[0].tolist() == [[True, False], [True, False], [True, False], [True, True]]
+
+
+def test_tasks_are_swept_around_the_uavs() -> None:
+    """Not around a depot that none of them flies to."""
+    rng = np.random.default_rng(0)
+    tasks, places = 10 + rng.random((12, 2)), np.full((2, 2), 10.5)
+    apart = Instances.from_arrays([0, 0], tasks, n_uavs=2, start=places, end=places)
+    assert sweep_order(apart).tolist() == sweep_order(Instances.from_arrays(places[0], tasks, n_uavs=2)).tolist()
+
+
+def test_places_and_loads_of_uavs() -> None:
+    """Relative to the mean of the ends, in units of the longest range; a fair share is as large as the range."""
+    static = StaticObservation.from_instances(two_uavs())
+    world = World.of(static)
+    assert world.start[0].tolist() == [[-0.25, 0.0], [-0.25, 0.0]] and world.end[0].tolist() == [[0.25, 0.0], [-0.25, 0.0]]
+    assert world.reach.tolist() == [[1.0, 0.5]]
+    geometry = FleetGeometry.of(static, whole=True)
+    features = geometry.features(geometry.initial(1, 2), th.zeros(1, 1, dtype=th.int64), th.full((1, 1, 4), -1))
+    # A first task of four, for UAVs that have two thirds and one third of all range.
+    assert features[0, 0, :, FleetFeature.LOAD].tolist() == pytest.approx([0.5 / (4 / 3), 0.5 / (2 / 3)])
+
+
+def test_slack_of_a_move_is_what_is_left_after_service() -> None:
+    """From the start at 10 over the task at 12, which costs 1, to the end at 14: 3 of 8 are left."""
+    instance = Instances.from_arrays([0, 0], [[12, 0]], None, 8, 1, start=[[10, 0]], end=[[14, 0]], service=[1.0])
+    geometry = MoveGeometry.of(StaticObservation.from_instances(instance), whole=True)
+    zero, mask = th.zeros(1, 1, dtype=th.int64), th.tensor([[[False, True]]])
+    features = geometry.features(zero, th.ones(1, 1), mask)
+    assert float(features[0, 0, 1, MoveFeature.SLACK]) == pytest.approx(FAR_SCALE * 3 / 8)

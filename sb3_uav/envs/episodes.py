@@ -88,7 +88,7 @@ class Episodes:
         if beyond and not self.problem.is_whole:
             raise ValueError(
                 f"The instance has {', '.join(beyond)}, which the observations of this environment do not show; make it with "
-                "a generator of such instances."
+                "a generator of such instances, whose attribute beyond_the_paper is true."
             )
         if instances.n_tasks > n_tasks:
             raise ValueError(

@@ -282,7 +282,9 @@ class AllocatorPolicy(EpisodicPolicy):
 
         :param instances: ``batch`` instances on the device of the policy
         :return: Node embeddings ``(batch, n_tasks + 1, embed_dim)``
+        :raises ValueError: If they go beyond what the network sees
         """
+        self.check_problem(instances)
         self.set_training_mode(False)
         return self.features_extractor.encode_nodes(StaticObservation.from_instances(instances))
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 
 from sb3_uav.envs.allocation import split_tasks
-from sb3_uav.envs.generators import InstanceGenerator
+from sb3_uav.envs.generators import InstanceGenerator, goes_beyond_the_paper
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
@@ -44,6 +44,10 @@ class _DividedSubsets:
     @property
     def n_tasks(self) -> int:
         return self.generator.n_tasks
+
+    @property
+    def beyond_the_paper(self) -> bool:
+        return goes_beyond_the_paper(self.generator)
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """
