@@ -288,3 +288,10 @@ def test_slack_of_a_move_is_what_is_left_after_service() -> None:
     zero, mask = th.zeros(1, 1, dtype=th.int64), th.tensor([[[False, True]]])
     features = geometry.features(zero, th.ones(1, 1), mask)
     assert float(features[0, 0, 1, MoveFeature.SLACK]) == pytest.approx(FAR_SCALE * 3 / 8)
+
+
+def test_the_end_of_a_grounded_uav_moves_nothing() -> None:
+    """Networks would see all tasks far away, in the same place."""
+    ends = [[[14, 0], [10, 0]], [[14, 0], [9e3, 0]], [[9e3, 0], [10, 0]]]
+    homes = [StaticObservation.from_instances(replace(two_uavs(), end=th.tensor([end]).double())).home for end in ends]
+    assert [home.tolist() for home in homes] == [[[12.0, 0.0]], [[14.0, 0.0]], [[10.0, 0.0]]]

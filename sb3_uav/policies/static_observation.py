@@ -7,7 +7,11 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import TensorDict
 
+from sb3_uav.envs.distances import euclidean
 from sb3_uav.envs.instances import Instances
+
+# Of distances in float32, as a part of them.
+_ROUNDING = 1e-5
 
 
 class StaticObservation(NamedTuple):
@@ -77,11 +81,17 @@ class StaticObservation(NamedTuple):
 
     @property
     def home(self) -> th.Tensor:
-        """The origin of the networks' coordinates: the mean of the UAVs' ends, ``(batch, 2)``."""
+        """The origin of the networks' coordinates: the mean of the ends of the UAVs that can fly, ``(batch, 2)``."""
         if self.end is None:
             return self.depot
+        start = self.depot[:, None] if self.start is None else self.start
+        limit = self.max_distance if self.uav_distance is None else self.uav_distance
+        # The ends of grounded UAVs may be anywhere.
+        flies = euclidean(start, self.end) <= (1 + _ROUNDING) * limit
+        first = self.end.gather(1, flies.to(th.int8).argmax(1)[:, None, None].expand(-1, 1, 2))
         # Exact where all are equal.
-        return self.end[:, 0] + (self.end - self.end[:, :1]).mean(1)
+        offset = (self.end - first).masked_fill(~flies[..., None], 0.0)
+        return first[:, 0] + offset.sum(1) / flies.sum(1, keepdim=True).clamp(min=1)
 
 
 def _unit(max_distance: th.Tensor) -> th.Tensor:
