@@ -372,14 +372,17 @@ class Instances:
     def near_origin(self) -> Instances:
         """
         Translate each row whose depot is far from the origin, relative to the maximum flight distance, so that its depot is at
-        the origin. Where UAVs have ends of their own, the first of these counts: their depot may be anywhere.
+        the origin. Where UAVs have ends of their own, that of the first one that can fly counts: the depot may be anywhere.
 
         float32 resolves coordinates around 1e7 only to whole units. Call this before converting to float32, so that a
         network's input does not depend on where the instance lies. Rows near the origin, such as the paper's, stay bit-equal.
 
         :return: The translated instances
         """
-        place = self.depot if self.end is None else self.end[:, 0]
+        place = self.depot
+        if self.end is not None:
+            flies = euclidean(self.uav_start, self.end) <= distance_limit(self.uav_distance)
+            place = self.end.gather(1, flies.to(th.int8).argmax(1)[:, None, None].expand(-1, 1, 2))[:, 0]
         is_far = place.abs().amax(1) > _FAR_FROM_ORIGIN * self.unit
         shift = place.where(is_far[:, None], 0.0)
         moved = replace(self, depot=self.depot - shift)
