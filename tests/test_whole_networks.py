@@ -19,6 +19,7 @@ from sb3_uav.envs import Instances, RoutePlanningEnv, TaskAllocationEnv, Uniform
 from sb3_uav.envs.allocation import plan_tours, schedules
 from sb3_uav.envs.problem import WHOLE_KEYS
 from sb3_uav.solvers.dl_drl import DLDRL
+from sb3_uav.solvers.kmeans_am import KMeansAM
 
 levels = pytest.mark.parametrize("level", ["allocator", "router"])
 
@@ -75,6 +76,14 @@ def test_every_schedule_of_the_pair_is_feasible(instances: Instances, seed: int)
         solver = DLDRL(allocator, router, decode, samples=16)  # type: ignore[arg-type]
         for row, result in enumerate(solver.solve(instances, seed=seed)):
             check_schedule(instances, row, result.schedule)
+
+
+@settings(max_examples=20)
+@given(instances=whole_batches(max_tasks=6))
+def test_kmeans_with_a_router_that_sees_the_whole_problem(instances: Instances) -> None:
+    solver = KMeansAM(make_policy("router", "whole", 4, 1))  # type: ignore[arg-type]
+    for row, result in enumerate(solver.solve(instances)):
+        check_schedule(instances, row, result.schedule)
 
 
 def routes_of(instances: Instances) -> list[Any]:
