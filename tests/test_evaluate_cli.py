@@ -219,10 +219,11 @@ def test_tasks_that_must_be_served_are_named_where_they_are_not(tmp_path: Path, 
     tasks, must = [[0.5, 0.0], [3.0, 0.0], [-0.9, 0.0]], [True, True, True]
     one = Instances.from_arrays([0.0, 0.0], tasks, max_distance=[1.9, 1.0], n_uavs=2, must_serve=must)
     one.save(tmp_path / "one.npz")
-    assert run("--solvers", "local-search:time_limit=0.05", "--instances", tmp_path / "one.npz", "--out", tmp_path / "out") == 0
+    solver, out = "local-search:time_limit=0.05", tmp_path / "out"
+    assert run("--solvers", solver, "--instances", tmp_path / "one.npz", "--out", out) == 0
     said = capsys.readouterr().err
     assert "one: 1 of 3 tasks are out of reach of every UAV" in said
     assert "one: instance 0: tasks that must be served are among them: 1." in said
-    (line,) = (tmp_path / "out" / "schedules.jsonl").read_text().splitlines()
+    (line,) = (out / "schedules.jsonl").read_text().splitlines()
     record = json.loads(line)
     assert record["unserved"] == [1] and sorted(task for route in record["routes"] for task in route) == [0, 2]

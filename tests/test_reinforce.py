@@ -21,6 +21,7 @@ from sb3_uav.envs import (
 )
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.reinforce import REINFORCE, losses
+from sb3_uav.reinforce.advantages import scale_by_instance
 
 # ------------------------------------------------------------------------------------------ learning
 
@@ -147,6 +148,28 @@ def test_loss_is_the_papers(baseline, normalize):
     by_hand = GradientByHand(loss)
     model = make_model(baseline=baseline, normalize_advantage=normalize, max_grad_norm=1e9).learn_instances(4, by_hand)
     assert_gradient(model, by_hand)
+
+
+def test_advantages_can_be_scaled_instance_by_instance():
+    """An instance that is worth a million times as much does not weigh a million times as much."""
+    advantages = th.tensor([[1.0, -1.0, 0.0], [2e6, -1e6, -1e6], [0.0, 0.0, 0.0], [3.0, 0.0, -3.0]])
+    scaled = scale_by_instance(advantages)
+    deviation = advantages.std(1)
+    assert deviation.median() == deviation[0] == 1.0
+    th.testing.assert_close(scaled[0], advantages[0] / 2)
+    th.testing.assert_close(scaled[1], advantages[1] / (deviation[1] + 1))
+    assert (scaled[2] == 0).all() and scaled.abs().max() < 2
+    assert not scale_by_instance(th.zeros(4, 3)).any()
+
+    def loss(batch: Any, evaluation: Any) -> th.Tensor:
+        gain = scale_by_instance((batch.returns - batch.returns.mean(1, keepdim=True)).float())
+        return -(gain * evaluation.log_prob.sum(-1)).mean()
+
+    by_hand = GradientByHand(loss)
+    model = make_model(baseline="shared", normalize_advantage="instance", max_grad_norm=1e9).learn_instances(4, by_hand)
+    assert_gradient(model, by_hand)
+    with pytest.raises(ValueError, match="normalize_advantage is 'row'; give True, False or 'instance'"):
+        make_model(normalize_advantage="row")
 
 
 @pytest.mark.parametrize("normalize", [False, True])

@@ -26,6 +26,7 @@ from sb3_uav.policies.move_geometry import MoveFeature, MoveGeometry
 from sb3_uav.policies.static_observation import StaticObservation
 from sb3_uav.policies.world import World
 from sb3_uav.solvers.dl_drl import DLDRL
+from sb3_uav.solvers.kmeans_am import KMeansAM
 from sb3_uav.studies.compare.fixed_router import _DividedSubsets
 
 levels = pytest.mark.parametrize("level", ["allocator", "router"])
@@ -83,6 +84,14 @@ def test_every_schedule_of_the_pair_is_feasible(instances: Instances, seed: int)
         solver = DLDRL(allocator, router, decode, samples=16)  # type: ignore[arg-type]
         for row, result in enumerate(solver.solve(instances, seed=seed)):
             check_schedule(instances, row, result.schedule)
+
+
+@settings(max_examples=20)
+@given(instances=whole_batches(max_tasks=6))
+def test_kmeans_with_a_router_that_sees_the_whole_problem(instances: Instances) -> None:
+    solver = KMeansAM(make_policy("router", "whole", 4, 1))  # type: ignore[arg-type]
+    for row, result in enumerate(solver.solve(instances)):
+        check_schedule(instances, row, result.schedule)
 
 
 def routes_of(instances: Instances) -> list[Any]:

@@ -8,6 +8,8 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_uav.reinforce.baselines import Baseline
 
+# Value of ``normalize_advantage``.
+BY_INSTANCE = "instance"
 # Prevents a division by zero if all advantages are equal, as in SB3.
 _EPSILON = 1e-8
 
@@ -18,6 +20,20 @@ def scale_advantages(advantages: th.Tensor) -> th.Tensor:
     :return: The advantages divided by their standard deviation; a single advantage is returned unchanged
     """
     return advantages / (advantages.std() + _EPSILON) if advantages.numel() > 1 else advantages
+
+
+def scale_by_instance(advantages: th.Tensor) -> th.Tensor:
+    """
+    Scale the advantages of every instance by themselves, so that instances with large values do not outweigh the others.
+
+    :param advantages: ``(batch, n_samples)``
+    :return: Those of each instance divided by their standard deviation plus the median of these deviations, which keeps
+        differences of almost nothing small
+    """
+    if advantages.shape[-1] < 2:
+        return scale_advantages(advantages)
+    deviation = advantages.std(-1, keepdim=True)
+    return advantages / (deviation + deviation.median() + _EPSILON)
 
 
 def complete_steps(buffer: RolloutBuffer, last_episode_starts: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_uav.reinforce.advantages import scale_advantages
+from sb3_uav.reinforce.advantages import BY_INSTANCE, scale_advantages, scale_by_instance
 from sb3_uav.reinforce.episode_batch import EpisodeBatch
 
 
@@ -56,6 +56,9 @@ def step_loss(model: Any) -> th.Tensor:
 
 
 def _normalized(model: Any, advantages: th.Tensor) -> th.Tensor:
+    # The critic's advantages are those of steps, not of episodes.
+    if model.normalize_advantage == BY_INSTANCE and advantages.dim() == 2:
+        return scale_by_instance(advantages)
     return scale_advantages(advantages) if model.normalize_advantage else advantages
 
 

@@ -30,7 +30,7 @@ from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, MaskedAttentionPolicy, RouterPolicy
-from sb3_uav.reinforce.advantages import complete_steps, step_advantages
+from sb3_uav.reinforce.advantages import BY_INSTANCE, complete_steps, step_advantages
 from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
@@ -79,7 +79,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
     :param vf_coef: Value function coefficient for the loss calculation (baseline ``critic``)
     :param max_grad_norm: The maximum value for the gradient clipping
     :param normalize_advantage: Whether to divide advantages by their standard deviation (SB3's loop, like SB3's A2C, also
-        subtracts their mean)
+        subtracts their mean); ``"instance"`` divides those of each instance by their own (fused driver), for instances whose
+        returns differ much
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
@@ -116,7 +117,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         ent_coef: float = 0.0,
         vf_coef: float = 0.5,
         max_grad_norm: float = 1.0,
-        normalize_advantage: bool = False,
+        normalize_advantage: bool | str = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -149,6 +150,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         self.baseline_kwargs = baseline_kwargs or {}
         self.instances_per_epoch = instances_per_epoch
         self.lr_decay = lr_decay
+        if isinstance(normalize_advantage, str) and normalize_advantage != BY_INSTANCE:
+            raise ValueError(f"normalize_advantage is {normalize_advantage!r}; give True, False or {BY_INSTANCE!r}.")
         self.normalize_advantage = normalize_advantage
         # State from which a resumed run continues as if it had not been interrupted.
         self.stream_seed = draw_seed() if seed is None else seed
@@ -252,7 +255,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         else:
             assert self._last_episode_starts is not None
             complete = complete_steps(rollout_buffer, self._last_episode_starts)
-        rollout_buffer.advantages = step_advantages(rollout_buffer, complete, self._baseline, self.normalize_advantage)
+        rollout_buffer.advantages = step_advantages(rollout_buffer, complete, self._baseline, bool(self.normalize_advantage))
         return True
 
     def _collect_episodes(self, problem: Problem, env: VecEnv, callback: BaseCallback) -> bool:

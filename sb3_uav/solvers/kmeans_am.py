@@ -35,6 +35,7 @@ class KMeansAM(BatchedSolver):
     def __init__(self, router: RouterPolicy, restarts: int = 10, batch_size: int | None = None) -> None:
         super().__init__(batch_size)
         self.router = router
+        self.solves_whole_problem = router.settings.whole
         self.restarts = checked_restarts(restarts, "kmeans-am")
 
     def settings(self) -> dict[str, Any]:
