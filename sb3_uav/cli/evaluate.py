@@ -237,8 +237,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     failures = dict.fromkeys(failure for row in summary for failure in row.failures)
     for violation in violations:
         print(f"sb3-uav: wrong: {violation}", file=sys.stderr)
-    for failure in failures:
-        print(f"sb3-uav: {failure}", file=sys.stderr)
+    for line in (*failures, *dict.fromkeys(line for row in summary for line in row.unserved)):
+        print(f"sb3-uav: {line}", file=sys.stderr)
     if violations:
         return _INFEASIBLE
     return _FAILED if failures else _OK

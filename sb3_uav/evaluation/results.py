@@ -50,7 +50,7 @@ class ResultRow:
     :param batch_size: How many instances were solved at once
     :param bound: A proven upper bound of the objective; possibly also of a solver that found no schedule
     :param status: ``ok``; ``infeasible`` if the checker refused the schedule; ``failed`` if the solver returned none
-    :param message: What the checker or the solver said, in one line
+    :param message: What the checker or the solver said, in one line; with ``ok``, which tasks that must be served are not
     """
 
     solver: str

@@ -99,6 +99,9 @@ class SetEvaluation:
                 report = check_schedule(self.instances, row, result.schedule)
             except InfeasibleScheduleError as error:
                 status, message = INFEASIBLE, one_line(error)
+            if report is not None and report.unserved:
+                tasks = ", ".join(str(task) for task in report.unserved)
+                message = f"does not serve tasks that must be served: {tasks}"
             index = self.first_index + row
             line = schedule_to_json(solver.name, index, result.schedule, report or ScheduleReport(math.nan, ()))
             if report is None:

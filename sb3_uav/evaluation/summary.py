@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_uav.common.files import replaced_when_complete, write_csv
 from sb3_uav.common.statistics import CONFIDENCE, confidence_halfwidth
-from sb3_uav.evaluation.results import FAILED, INFEASIBLE, ResultRow
+from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, RESULTS_FILE, ResultRow
 
 SUMMARY_CSV, SUMMARY_JSON = "summary.csv", "summary.json"
 # Solvers prove bounds up to rounding errors.
@@ -46,6 +46,7 @@ class SummaryRow:
     :param batch_size: How many instances were solved at once (the largest batch)
     :param violations: Infeasible schedules and wrong bounds, one line each
     :param failures: Reasons of failures with the number of instances, one line each
+    :param unserved: On how many instances tasks that must be served are left out, if on any
     """
 
     solver: str
@@ -69,9 +70,11 @@ class SummaryRow:
     batch_size: int
     violations: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
+    unserved: tuple[str, ...] = ()
 
 
-_SUMMARY_COLUMNS = tuple(field.name for field in fields(SummaryRow) if field.name not in ("violations", "failures"))
+_MESSAGES = ("violations", "failures", "unserved")
+_SUMMARY_COLUMNS = tuple(field.name for field in fields(SummaryRow) if field.name not in _MESSAGES)
 
 
 def gaps(objectives: Sequence[float]) -> list[float]:
@@ -151,6 +154,7 @@ def summarize(
                 batch_size=max(row.batch_size or 0 for row in rows),
                 violations=(*_violations(rows), *_wrong_bounds(rows, best_found)),
                 failures=_failures(rows),
+                unserved=_unserved(rows),
             )
         )
     return summary
@@ -201,6 +205,18 @@ def _failures(rows: Sequence[ResultRow]) -> tuple[str, ...]:
         f"{rows[0].solver} failed on {count} of {len(rows)} instances of {rows[0].source}: {message}"
         for message, count in counts.items()
     )
+
+
+def _unserved(rows: Sequence[ResultRow]) -> tuple[str, ...]:
+    """
+    :param rows: Results of one solver
+    :return: On how many instances it leaves tasks that must be served, because means of values do not show that
+    """
+    n_rows = sum(row.status == OK and row.message != "" for row in rows)
+    if n_rows == 0:
+        return ()
+    text = "leaves out tasks that must be served, so that its value is no measure of how good its schedules are"
+    return (f"{rows[0].solver}, {n_rows} of {len(rows)} instances of {rows[0].source}: {text}; see {RESULTS_FILE}.",)
 
 
 def write_summary(summary: Sequence[SummaryRow], folder: Path, about: Mapping[str, Any]) -> None:
