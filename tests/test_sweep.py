@@ -82,3 +82,16 @@ def test_turning_keeps_all_distances(instances: Instances, angle: float) -> None
     offset = instances.tasks - instances.depot[:, None]
     expected = offset[..., 0] * math.cos(angle) - offset[..., 1] * math.sin(angle)
     th.testing.assert_close((turned.tasks - turned.depot[:, None])[..., 0], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_uavs_that_cannot_fly_do_not_move_the_center() -> None:
+    """Wherever a grounded UAV has to arrive; if none can fly, all count."""
+    tasks = [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]
+    orders = []
+    for far in (5.0, 500.0):
+        ends = [[0.1, 0.1], [far, far / 2]]
+        orders.append(sweep_order(Instances.from_arrays([0.0, 0.0], tasks, max_distance=[4.0, 1.0], n_uavs=2, end=ends)))
+    alone = sweep_order(Instances.from_arrays([0.0, 0.0], tasks, max_distance=4.0, n_uavs=1, end=[[0.1, 0.1]]))
+    assert th.equal(orders[0], orders[1]) and th.equal(orders[0], alone)
+    grounded = Instances.from_arrays([0.0, 0.0], tasks, max_distance=1.0, n_uavs=1, end=[[9.0, 9.0]])
+    assert sorted(sweep_order(grounded)[0].tolist()) == [0, 1, 2, 3]

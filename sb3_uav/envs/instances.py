@@ -204,6 +204,11 @@ class Instances:
         return self.depot[:, None].expand(-1, self.n_uavs, -1) if self.end is None else self.end
 
     @property
+    def can_fly(self) -> th.Tensor:
+        """Which UAVs can fly from their start straight to their end, ``(batch, n_uavs)`` bool."""
+        return euclidean(self.uav_start, self.uav_end) <= distance_limit(self.uav_distance)
+
+    @property
     def service_cost(self) -> th.Tensor:
         """What serving every task costs, ``(batch, n_tasks)``."""
         return th.zeros_like(self.values) if self.service is None else self.service
@@ -381,8 +386,7 @@ class Instances:
         """
         place = self.depot
         if self.end is not None:
-            flies = euclidean(self.uav_start, self.end) <= distance_limit(self.uav_distance)
-            place = self.end.gather(1, flies.to(th.int8).argmax(1)[:, None, None].expand(-1, 1, 2))[:, 0]
+            place = self.end.gather(1, self.can_fly.to(th.int8).argmax(1)[:, None, None].expand(-1, 1, 2))[:, 0]
         is_far = place.abs().amax(1) > _FAR_FROM_ORIGIN * self.unit
         shift = place.where(is_far[:, None], 0.0)
         moved = replace(self, depot=self.depot - shift)

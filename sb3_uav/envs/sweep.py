@@ -13,7 +13,7 @@ def sweep_order(instances: Instances, gap: int = 0, clockwise: bool = False) -> 
     """
     Sort tasks by their polar angle around the depot, starting after a wide gap between two of them.
 
-    Where UAVs differ, the center is the mean of the points midway between their starts and ends.
+    Where UAVs differ, the center is the mean of the points midway between start and end of those that can fly.
 
     :param instances: ``batch`` instances
     :param gap: Rank of the gap to start after: 0 for the widest, 1 for the second widest, ...
@@ -22,7 +22,9 @@ def sweep_order(instances: Instances, gap: int = 0, clockwise: bool = False) -> 
     """
     center = instances.depot
     if instances.start is not None or instances.end is not None:
-        center = ((instances.uav_start + instances.uav_end) / 2).mean(1)
+        flies = instances.can_fly | ~instances.can_fly.any(1, keepdim=True)
+        middle = (instances.uav_start + instances.uav_end) / 2
+        center = (middle * flies[..., None]).sum(1) / flies.sum(1, keepdim=True)
     offset = instances.tasks - center[:, None]
     angle = th.atan2(offset[..., 1], offset[..., 0])
     angle, order = (-angle if clockwise else angle).masked_fill(~instances.task_mask, th.inf).sort(dim=1, stable=True)
