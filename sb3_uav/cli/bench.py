@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_uav.cli.solver_specs import solvers_of
+from sb3_uav.cli.solver_specs import add_run_options, solvers_of
 from sb3_uav.common.optional import install_command, require
 
 if TYPE_CHECKING:
@@ -75,21 +75,10 @@ def _make_parser() -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="per instance, for solvers that use it; several run one after the other (default: each solver's own)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=1,
-        metavar="N",
-        help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
-    )
     parser.add_argument(
         "--use-rounding", action="store_true", help="OPLib: put more tasks into tours where rounding leaves room (see below)"
     )
-    parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
-    networks = parser.add_argument_group("networks")
-    networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
-    networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
+    add_run_options(parser)
     return parser
 
 

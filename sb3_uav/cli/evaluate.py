@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_uav.cli.solver_specs import solvers_of
+from sb3_uav.cli.solver_specs import add_run_options, solvers_of
 from sb3_uav.common.optional import install_command
 
 if TYPE_CHECKING:
@@ -67,18 +67,7 @@ def _make_parser() -> argparse.ArgumentParser:
         help="per instance, for solvers that use it; several run one after the other (default: each solver's own)",
     )
     parser.add_argument("--reference", metavar="NAME", help="solver that the others are compared with (default: the first)")
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=1,
-        metavar="N",
-        help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
-    networks = parser.add_argument_group("networks")
-    networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
-    networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
+    add_run_options(parser)
     pair = parser.add_argument_group("a trained pair, the first of the solvers")
     pair.add_argument("--allocator", type=Path, metavar="ZIP", help="SB3 zip of the allocator (needs --router)")
     pair.add_argument("--router", type=Path, metavar="ZIP", help="SB3 zip of the router (needs --allocator)")

@@ -1,12 +1,31 @@
-"""The solvers that a command line names."""
+"""The solvers that a command line names, and how they are to be run."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sb3_uav.solvers import Solver
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: Gets the options that every command has that runs solvers
+    """
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
+    networks = parser.add_argument_group("networks")
+    networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
+    networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")
 
 
 def solvers_of(
