@@ -17,11 +17,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.pretrained import ALLOCATOR_FILE, ROUTER_FILE
 from sb3_uav.reinforce.algorithms import ALGORITHMS, resolve_algorithm
+from sb3_uav.training.fixed_set import EVALUATIONS
 from sb3_uav.training.its_checkpoint import CHECKPOINT
 
 # Attributes that only the training that wrote them needs.
 LEFT_OUT = (
     CHECKPOINT,
+    EVALUATIONS,
     "tensorboard_log",
     "_last_obs",
     "_last_episode_starts",

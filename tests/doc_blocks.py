@@ -116,7 +116,11 @@ RULES = [
     Rule("docs/comparison/*_long/report.md", r"--variants long\.yml", "--variants small/reinforce_alone.yml"),
     Rule("docs/comparison/*_ppo/report.md", r"--variants ppo\.yml", "--variants small/ppo_alone.yml"),
     Rule("docs/comparison/*_*/report.md", r"--router allocator/router\.zip", "--router small/router.zip"),
-    Rule("sb3_uav/pretrained/*/README.md", r"(--env TaskAllocation-Universal-v0)", rf"\1 {_SMALL.format('reinforce')}"),
+    Rule(
+        "sb3_uav/pretrained/*/README.md",
+        r"(--env TaskAllocation-(?:Universal|World)-v0)",
+        rf"\1 {_SMALL.format('reinforce')}",
+    ),
 ]
 
 # What in the YAMLs is made smaller for the rules with ``small/``, wherever it stands.
@@ -232,7 +236,12 @@ def prepare(folder: Path, page: str) -> None:
 
 def _shrunk(entry: Any) -> Any:
     if isinstance(entry, dict):
-        return {key: _SMALLER.get(key, _shrunk(value)) for key, value in entry.items()}
+        smaller = {key: _SMALLER.get(key, _shrunk(value)) for key, value in entry.items()}
+        kwargs = entry.get("policy_kwargs")
+        if isinstance(kwargs, dict) and "preset" in kwargs:
+            # Other networks may refuse the environment.
+            smaller["policy_kwargs"] = {**_NETWORK, "preset": kwargs["preset"]}
+        return smaller
     return [_shrunk(value) for value in entry] if isinstance(entry, list) else entry
 
 

@@ -269,7 +269,8 @@ DISTRIBUTIONS = [
 ROUTERS = [
     (
         "nowhere",
-        "router: nowhere: no such file; give the zip of a router that was trained before, or one of ['universal']. Or give",
+        "router: nowhere: no such file; give the zip of a router that was trained before, or one of "
+        "['universal', 'world']. Or give",
     ),
     ("nowhere.zip", "nowhere.zip: no such file; give the zip of a router"),
     ("zoo_hooks.nowhere", "cannot be imported"),

@@ -182,7 +182,7 @@ def test_resumed_fine_tuning_equals_an_unbroken_one(pair: Path, tmp_path: Path) 
     [
         (7, ValueError, r"router must be the zip of a router, the name of a trained pair, or a mapping .* found 7"),
         ({"learning_rate": 1}, ValueError, "at least one of the keys 'policy', 'zip' and 'pretrained', found"),
-        ("none.zip", FileNotFoundError, r"router: none\.zip: no such file; .* or one of \['universal'\]"),
+        ("none.zip", FileNotFoundError, r"router: none\.zip: no such file; .* or one of \['universal', 'world'\]"),
         ({"zip": "none.zip"}, FileNotFoundError, r"none\.zip: no such file"),
         ({"pretrained": "magic"}, ValueError, "There is no trained pair 'magic'"),
         (
@@ -262,7 +262,9 @@ def test_shipped_pair_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     allocator = load_policy(zoo_folder(tmp_path) / f"{ENV}.zip", "cpu")
     assert allocator.settings.mixed_precision and not allocator.settings.use_values
     assert run(tmp_path, config, "-i", "magic", "-n", str(EPOCH)) == 2
-    assert "-i magic: no such file; give the zip of a trained agent, or one of ['universal']" in capsys.readouterr().err
+    assert (
+        "-i magic: no such file; give the zip of a trained agent, or one of ['universal', 'world']" in capsys.readouterr().err
+    )
 
 
 class OwnRoutes(RoutePlanningEnv):

@@ -12,7 +12,7 @@ import pytest
 from solver_helpers import objectives
 
 from sb3_uav import pretrained
-from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator
+from sb3_uav.envs import BatchedVecEnv, RoutePlanningEnv, TaskAllocationEnv, UniformGenerator, WorldGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
@@ -52,6 +52,14 @@ def test_model_cards_tell_what_they_must(name: str) -> None:
     assert "sb3_uav.zoo.train" in card and "seed" in card
 
 
+def test_a_pair_serves_fleets_of_unlike_uavs() -> None:
+    """Better than K-means and the nearest task."""
+    instances = WorldGenerator(40, 4, whole_share=1.0, paper_share=0.0)(16, np.random.default_rng(0))
+    assert not instances.has_equal_uavs
+    trained = objectives(make_solver("dl-drl:allocator=world,decode=sampling,samples=16"), instances).mean()
+    assert trained > 1.1 * objectives(make_solver("kmeans-nearest"), instances).mean()
+
+
 @pytest.mark.parametrize("n_uavs, n_tasks, max_distance", [(1, 1, 0.5), (2, 20, 2.0), (5, 60, 1.0), (8, 120, 3.0)])
 def test_one_pair_serves_any_fleet(n_uavs: int, n_tasks: int, max_distance: float) -> None:
     """Better than K-means and the nearest task, which random allocations are not."""
@@ -68,7 +76,7 @@ def test_names_and_zips() -> None:
     assert load_dl_drl("universal").settings() == load_dl_drl(str(allocator), str(router)).settings()
     with pytest.raises(ValueError, match=r"a\.zip is one zip of a pair, and its router is missing"):
         pretrained.pair_files("a.zip")
-    with pytest.raises(ValueError, match=r"There is no trained pair 'magic'; choose one of \['universal'\]"):
+    with pytest.raises(ValueError, match=r"There is no trained pair 'magic'; choose one of \['universal', 'world'\]"):
         pretrained.files("magic")
 
 
@@ -82,7 +90,8 @@ def test_routers_by_name_or_zip(tmp_path: Path) -> None:
     other = pretrained.load("universal", env=env, router=shipped, device="cpu")
     plans = [found.env.get_attr("problem")[0].router.__self__ for found in (model, other)]
     assert parameters_hash(plans[0]) == parameters_hash(plans[1]) == parameters_hash(load_policy(shipped, "cpu"))
-    message = r"^router: magic: no such file; give the zip of a router that was trained before, or one of \['universal'\]\.$"
+    known = r"\['universal', 'world'\]"
+    message = rf"^router: magic: no such file; give the zip of a router that was trained before, or one of {known}\.$"
     with pytest.raises(FileNotFoundError, match=message):
         pretrained.load("universal", env=env, router="magic")
     with pytest.raises(FileNotFoundError, match=message):

@@ -42,7 +42,7 @@ def test_pretrained_router_gives_the_rewards(tmp_path):
 
 def test_pretrained_router_by_the_name_of_its_pair():
     assert PretrainedRouterCallback("universal").router == pretrained.files()[1]
-    with pytest.raises(FileNotFoundError, match=r"router: magic: no such file; .* or one of \['universal'\]"):
+    with pytest.raises(FileNotFoundError, match=r"router: magic: no such file; .* or one of \['universal', 'world'\]"):
         PretrainedRouterCallback("magic")
 
 

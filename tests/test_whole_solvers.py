@@ -206,7 +206,9 @@ def test_every_solver_solves_the_whole_problem_or_says_that_it_does_not(batch: I
                 assert (result.schedule.n_visited > 0) == bool(worth.any()), solver.name
                 score(batch, row, result.schedule)
         else:
-            message = f"^{re.escape(solver.name)} solves only .* these have {', '.join(needs_more)}; choose another solver"
+            message = (
+                f"^{re.escape(solver.name)} solves only .* these have {', '.join(needs_more)}; {re.escape(solver.remedy)}\\.$"
+            )
             for action in (solver.check, solver.solve):
                 with pytest.raises(ValueError, match=message):
                     action(batch)

@@ -58,6 +58,7 @@ class Solver(ABC):
     :ivar uses_time_limit: Whether the schedules may depend on the time limit; if not, evaluations at several time limits run
         the solver once
     :ivar solves_whole_problem: Whether UAVs may have their own starts, ends and distances, and tasks service costs
+    :ivar remedy: What to do about instances that it cannot solve for that reason
     :ivar name: Label in tables and files
     :ivar spec: The text that :func:`~sb3_uav.solvers.registry.make_solver` made it from
     :ivar files: Files that it was loaded from, by their purpose; evaluations record their hashes
@@ -65,6 +66,7 @@ class Solver(ABC):
 
     uses_time_limit: bool = True
     solves_whole_problem: bool = False
+    remedy: str = "choose another solver"
     name: str
     spec: str | None = None
     files: Mapping[str, Path] = {}
@@ -88,7 +90,7 @@ class Solver(ABC):
         if beyond and not self.solves_whole_problem:
             raise ValueError(
                 f"{self.name} solves only instances whose UAVs all fly equally far, from the depot to the depot, without "
-                f"service costs; these have {', '.join(beyond)}; choose another solver."
+                f"service costs; these have {', '.join(beyond)}; {self.remedy}."
             )
 
     def prepare(self) -> None:  # noqa: B027 (most solvers have nothing to prepare)

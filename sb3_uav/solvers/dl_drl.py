@@ -63,6 +63,7 @@ class DLDRL(BatchedSolver):
         self.allocator = allocator
         self.router = router
         self.serves_any_fleet = allocator.n_uavs is None
+        self.remedy = "give networks with preset=whole, such as those of the pair 'world' (dl-drl:allocator=world)"
         self.solves_whole_problem = allocator.settings.whole and router.settings.whole
         self.decode = decode
         self.samples = samples

@@ -37,7 +37,7 @@ TABLE_FILE = "size_grid.csv"
 # Where a stock EvalCallback of the same run writes its results instead; it appends the suffix .npz.
 _STOCK_RESULTS = "evaluations_eval_callback"
 # An attribute of the model, so that every zip of it names its earlier evaluations: SB3 starts counting steps again from 0.
-_STATE = "fixed_set_evaluations"
+EVALUATIONS = "fixed_set_evaluations"
 # SB3's EvalCallback is called every 10,000 calls, rl_zoo3's every 25,000 steps.
 _DEFAULT_EVAL_FREQ = 25_000
 
@@ -247,7 +247,7 @@ class FixedSetEvalCallback(BestPairOwner):
     @property
     def _state(self) -> dict[str, Any]:
         """The model's own record: steps and seconds of training, and the folder of the evaluations of each set."""
-        return getattr(self.model, _STATE, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
+        return getattr(self.model, EVALUATIONS, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
 
     def _note_state(self, seconds: np.ndarray) -> None:
         """
@@ -261,7 +261,7 @@ class FixedSetEvalCallback(BestPairOwner):
             "seconds": seconds.tolist(),
             "folders": {**self._state["folders"], self._fingerprint: folder},
         }
-        setattr(self.model, _STATE, state)
+        setattr(self.model, EVALUATIONS, state)
 
     def _continue(self, sets: InstanceSets) -> None:
         """Continue the history of the model's earlier training, or begin a new one."""
