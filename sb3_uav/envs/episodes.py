@@ -84,7 +84,7 @@ class Episodes:
                 f"The instance has {instances.n_uavs} UAVs, but the environment was made for {n_uavs}; "
                 f"make the environment with n_uavs={instances.n_uavs}."
             )
-        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        beyond = instances.beyond_the_paper
         if beyond and not self.problem.is_whole:
             raise ValueError(
                 f"The instance has {', '.join(beyond)}, which the observations of this environment do not show; make it with "

@@ -211,8 +211,8 @@ class FixedGenerator:
 
     @property
     def beyond_the_paper(self) -> bool:
-        """Whether the instances have more than tasks that must be served."""
-        return any(name != "must_serve" for name in self.instances.beyond_the_paper)
+        """Whether the instances have starts, ends and distances of each UAV, or service costs."""
+        return bool(self.instances.beyond_the_paper)
 
     def __call__(self, batch_size: int, rng: np.random.Generator) -> Instances:
         return self.instances[rng.integers(len(self.instances), size=batch_size)]

@@ -174,9 +174,9 @@ class Instances:
 
     @property
     def beyond_the_paper(self) -> list[str]:
-        """Names of the fields that make this another problem than the paper's."""
+        """Names of the fields that make this another problem than the paper's; ``must_serve`` only changes :attr:`prizes`."""
         ranges = ["max_distance per UAV"] if self.max_distance.dim() == 2 else []
-        return ranges + [name for name in _OPTIONAL_FIELDS if getattr(self, name) is not None]
+        return ranges + [name for name in ("start", "end", "service") if getattr(self, name) is not None]
 
     @property
     def useful_fleet(self) -> int:

@@ -98,7 +98,7 @@ class EpisodicPolicy(MaskedPolicy):
         :param instances: Any instances
         :raises ValueError: If they go beyond what the network sees
         """
-        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        beyond = instances.beyond_the_paper
         if beyond and not self.settings.whole:
             raise ValueError(
                 f"This {type(self).__name__} sees only the paper's problem, but the instances have {', '.join(beyond)}; use "

@@ -85,8 +85,7 @@ class Solver(ABC):
         :param instances: The instances to solve
         :raises ValueError: If the solver cannot solve them; the message says why
         """
-        # What must be served is a matter of value for every solver, see CountingTasks.
-        beyond = [name for name in instances.beyond_the_paper if name != "must_serve"]
+        beyond = instances.beyond_the_paper
         if beyond and not self.solves_whole_problem:
             raise ValueError(
                 f"{self.name} solves only instances whose UAVs all fly equally far, from the depot to the depot, without "
