@@ -24,6 +24,7 @@ ROOMS = (
     "solvers",
     "evaluation",
     "plots",
+    "missions",
     "zoo",
     "studies",
     "reproduce",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,6 +62,8 @@ class Solver(ABC):
     :ivar name: Label in tables and files
     :ivar spec: The text that :func:`~sb3_uav.solvers.registry.make_solver` made it from
     :ivar files: Files that it was loaded from, by their purpose; evaluations record their hashes
+    :ivar on_incumbent: Called with the row of an instance and a feasible schedule of it as soon as one is known, in any
+        thread, by solvers that find one after the other; a later one may be worse
     """
 
     uses_time_limit: bool = True
@@ -70,6 +72,7 @@ class Solver(ABC):
     name: str
     spec: str | None = None
     files: Mapping[str, Path] = {}
+    on_incumbent: Callable[[int, Schedule], None] | None = None
 
     def settings(self) -> dict[str, Any] | None:
         """

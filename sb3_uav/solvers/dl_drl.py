@@ -115,6 +115,9 @@ class DLDRL(BatchedSolver):
         share = 1.0 - self.refinement.share
         on_cpu, instances = instances, instances.to(self.allocator.device)
         first = self.refinement.first_candidates(on_cpu, start + seconds)
+        for place, schedules in enumerate(first):
+            for schedule in schedules:
+                self._report(place, schedule)
         self.allocator.set_training_mode(False)
         decoder = Decoder(self.allocator, self.router, self.decode, self.samples)
         found = Shortlists(len(instances), self.refinement.n_candidates)
@@ -122,12 +125,15 @@ class DLDRL(BatchedSolver):
         before = time.perf_counter()
         for block in decoder.blocks(instances, rows, seed, hurry=time_limit is not None):
             found.add(block)
+            if self.on_incumbent is not None:
+                for place, schedules in enumerate(found.schedules()):
+                    self._report(place, schedules[0])
             now = time.perf_counter()
             if now + (now - before) > start + share * seconds:
                 break
             before = now
         candidates = [[*early, *late] for early, late in zip(first, found.schedules(), strict=True)]
-        return self.refinement(on_cpu, candidates, start + seconds, seed)
+        return self.refinement(on_cpu, candidates, start + seconds, seed, self._report)
 
 
 def load_dl_drl(

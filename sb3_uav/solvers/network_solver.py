@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch as th
 
@@ -32,6 +32,7 @@ class BatchedSolver(Solver):
         if batch_size is not None and batch_size < 1:
             raise ValueError(f"batch_size is {batch_size}; give at least 1.")
         self.batch_size = batch_size
+        self._report: Callable[[int, Schedule], None] = lambda place, schedule: None
 
     @abstractmethod
     def rows_that_fit(self, instances: Instances) -> int:
@@ -71,10 +72,23 @@ class BatchedSolver(Solver):
                 start = time.perf_counter()
                 batch = group[taken]
                 n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
+                self._report = self._reporter(counting, rows, taken)
                 found = self.solve_batch(batch.trim(n_tasks), [rows[place] for place in taken], seed, time_limit)
                 seconds = (time.perf_counter() - start) / len(taken)
                 for place, schedule in zip(taken, found, strict=True):
                     yield rows[place], SolverResult(counting.schedule(place, schedule), seconds, len(taken))
+
+    def _reporter(self, counting: CountingTasks, rows: Sequence[int], taken: Sequence[int]) -> Callable[[int, Schedule], None]:
+        """
+        :param counting: What counts of the instances
+        :param rows: Their row indices
+        :param taken: Those of a batch, by their place among the rows
+        :return: Takes the place of an instance in the batch and a schedule of it, for :attr:`on_incumbent`
+        """
+        on_incumbent = self.on_incumbent
+        if on_incumbent is None:
+            return lambda place, schedule: None
+        return lambda place, schedule: on_incumbent(rows[taken[place]], counting.schedule(taken[place], schedule))
 
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         results = dict(self.solve_rows(instances, range(len(instances)), time_limit, seed))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import torch as th
 
@@ -88,13 +89,19 @@ class Refinement:
             return list(pool.map(lambda i: [repaired_insertion(instances[i], seconds)], range(len(instances))))
 
     def __call__(
-        self, instances: Instances, candidates: Sequence[Sequence[Schedule]], deadline: float, seed: int = 0
+        self,
+        instances: Instances,
+        candidates: Sequence[Sequence[Schedule]],
+        deadline: float,
+        seed: int = 0,
+        report: Callable[[int, Schedule], None] = lambda row, schedule: None,
     ) -> list[Schedule]:
         """
         :param instances: ``batch`` instances on the CPU
         :param candidates: At least one feasible schedule of each
         :param deadline: When to end, in seconds of ``time.perf_counter``
         :param seed: Seed for polishing
+        :param report: Told the row of an instance and what was found for it before polishing ends
         :return: One schedule for each, not worse than its best candidate; if nothing is wanted, its first
         """
         if not self.is_wanted:
@@ -111,10 +118,16 @@ class Refinement:
             seconds = None if math.isinf(repairing) else max(repairing, _LEAST_REPAIR_SECONDS)
         with ThreadPoolExecutor(n_threads) as pool:
             best = list(pool.map(lambda i: repair_best(instances[i], candidates[i], seconds), range(len(instances))))
+            for row, schedule in enumerate(best):
+                report(row, schedule)
             seconds = min(self.polish, (deadline - time.perf_counter()) / n_rounds)
             if seconds <= 0:
                 return best
-            return list(pool.map(lambda i: polish(instances[i], best[i], seconds, seed), range(len(instances))))
+
+            def polished(row: int) -> Schedule:
+                return polish(instances[row], best[row], seconds, seed, partial(report, row))
+
+            return list(pool.map(polished, range(len(instances))))
 
 
 def _threads(instances: Instances) -> tuple[int, int]:
@@ -126,7 +139,13 @@ def _threads(instances: Instances) -> tuple[int, int]:
     return n_threads, math.ceil(len(instances) / n_threads)
 
 
-def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 0) -> Schedule:
+def polish(
+    instance: Instances,
+    schedule: Schedule,
+    seconds: float,
+    seed: int = 0,
+    report: Callable[[Schedule], None] = lambda schedule: None,
+) -> Schedule:
     """
     Improve a schedule: first by ruin and recreate, then by PyVRP, starting from its result.
 
@@ -136,6 +155,7 @@ def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 
     :param schedule: A feasible schedule of it
     :param seconds: Wall time
     :param seed: Seed for both
+    :param report: Told what ruin and recreate found
     :return: A feasible schedule of at least the same value
     :raises ImportError: If numba is not installed
     :raises ValueError: If the time is not a finite number above 0
@@ -148,6 +168,7 @@ def polish(instance: Instances, schedule: Schedule, seconds: float, seed: int = 
     n_tasks = max(int(instance.task_mask.sum()), 1)
     instance = instance.trim(n_tasks)
     found = improve(instance, schedule, share * seconds, seed)
+    report(found)
     left = start + seconds - time.perf_counter()
     if share == 1.0 or left <= 0:
         return found

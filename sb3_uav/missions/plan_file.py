@@ -1,0 +1,134 @@
+"""Plans in files, complete enough to draw, fly and replan them without the files that they were made from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_uav.common.files import write_atomically
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.missions.fleet import Fleet, Uav
+from sb3_uav.missions.plan import Plan
+from sb3_uav.missions.search import make_plan
+from sb3_uav.missions.tasks import TaskList
+
+PLAN_FILE = "mission.json"
+_VERSION = 1
+
+
+def plan_to_json(plan: Plan) -> dict[str, Any]:
+    """
+    :param plan: A plan
+    :return: Plain data
+    """
+    tasks = plan.tasks
+    return {
+        "format": "sb3-uav mission",
+        "version": _VERSION,
+        "system": tasks.system,
+        "meters_per_unit": tasks.meters_per_unit,
+        "depot": None if tasks.depot is None else tasks.depot.tolist(),
+        "source": tasks.source,
+        "tasks": [
+            {
+                "id": tasks.ids[task],
+                "point": tasks.points[task].tolist(),
+                "value": float(tasks.values[task]),
+                "service_s": float(tasks.service_s[task]),
+                "must": bool(tasks.must[task]),
+                "altitude_m": None if np.isnan(tasks.altitudes[task]) else float(tasks.altitudes[task]),
+            }
+            for task in range(len(tasks))
+        ],
+        "fleet": [
+            {
+                "id": uav.id,
+                "range_m": uav.range_m,
+                "speed_mps": uav.speed_mps,
+                "start": None if uav.start is None else list(uav.start),
+                "end": None if uav.end is None else list(uav.end),
+                "reserve_percent": uav.reserve_percent,
+            }
+            for uav in plan.fleet
+        ],
+        "routes": [[tasks.ids[task] for task in route.stops] for route in plan.routes],
+        "solver": plan.solver,
+        "seed": plan.seed,
+        "seconds": plan.seconds,
+        "bound": plan.bound,
+    }
+
+
+def plan_from_json(data: Any, source: str) -> Plan:
+    """
+    :param data: What :func:`plan_to_json` returned, possibly changed by somebody else
+    :param source: Name of the file, for errors
+    :return: The plan, checked anew
+    :raises ValueError: If something is missing, wrong or infeasible
+    """
+    if not isinstance(data, dict) or data.get("format") != "sb3-uav mission":
+        raise ValueError(f'{source}: this is not a plan of sb3-uav solve, which has "format": "sb3-uav mission".')
+    if data.get("version") != _VERSION:
+        raise ValueError(f"{source}: version is {data.get('version')!r}, but this release reads {_VERSION}; plan anew.")
+    try:
+        tasks = TaskList.of(
+            [task["id"] for task in data["tasks"]],
+            [task["point"] for task in data["tasks"]],
+            data["system"],
+            [task["value"] for task in data["tasks"]],
+            [task["service_s"] for task in data["tasks"]],
+            [task["must"] for task in data["tasks"]],
+            depot=data["depot"],
+            altitudes=np.array(
+                [np.nan if task["altitude_m"] is None else task["altitude_m"] for task in data["tasks"]], float
+            ),
+            meters_per_unit=float(data["meters_per_unit"]),
+            source=str(data["source"]),
+        )
+        uavs = [
+            Uav(
+                str(uav["id"]),
+                float(uav["range_m"]),
+                None if uav["speed_mps"] is None else float(uav["speed_mps"]),
+                _point(uav["start"]),
+                _point(uav["end"]),
+                float(uav["reserve_percent"]),
+            )
+            for uav in data["fleet"]
+        ]
+        number = {name: task for task, name in enumerate(tasks.ids)}
+        schedule = Schedule([[number[str(name)] for name in route] for route in data["routes"]])
+        solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
+    return make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
+
+
+def _point(given: Any) -> tuple[float, float] | None:
+    return None if given is None else (float(given[0]), float(given[1]))
+
+
+def save_plan(plan: Plan, path: Path) -> None:
+    """
+    :param plan: A plan
+    :param path: The file to write
+    :raises OSError: If it cannot be written
+    """
+    write_atomically(path, json.dumps(plan_to_json(plan), indent=1) + "\n")
+
+
+def load_plan(path: Path) -> Plan:
+    """
+    :param path: The file
+    :return: The plan, checked anew
+    :raises OSError: If it cannot be read
+    :raises ValueError: If it is not an intact plan
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: this is not JSON ({error}).") from error
+    return plan_from_json(data, str(path))
