@@ -25,6 +25,7 @@ ROOMS = (
     "evaluation",
     "plots",
     "missions",
+    "web",
     "zoo",
     "studies",
     "reproduce",
