@@ -123,7 +123,7 @@ def test_time_limit_limits_samples_and_polish(instances: Instances, monkeypatch:
         clock.now += 1e-4  # type: ignore[attr-defined]
         return clock.now  # type: ignore[attr-defined]
 
-    def noting(instance: Instances, schedule: Schedule, seconds: float, seed: int) -> Schedule:
+    def noting(instance: Instances, schedule: Schedule, seconds: float, *_: Any) -> Schedule:
         spent.append(seconds)
         return schedule
 
