@@ -13,8 +13,8 @@ import re
 from sb3_uav.missions.readers.json_file import decode_utf8, shown
 from sb3_uav.missions.readers.waypoints import ReadItem, tasks_of_items
 from sb3_uav.missions.tasks import TaskList
+from sb3_uav.missions.writers.wpl import HEADER
 
-HEADER = "QGC WPL 110"
 _N_FIELDS = 12
 _FIELDS = (
     "index", "current", "frame", "command", "param 1", "param 2", "param 3", "param 4", "latitude", "longitude", "altitude",
