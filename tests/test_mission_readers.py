@@ -124,6 +124,23 @@ def test_oplib():
         assert [uav.range_m for uav in tasks.fleet] == [10]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        # As tests with random bytes found it: a section after the end is none.
+        ("NODE_SCORE_SECTION", "EOF\nNODE_SCORE_SECTION", "DIMENSION is 3, but NODE_SCORE_SECTION has 0 lines"),
+        ("EOF", "Edge_Weight_SECTION\n1\nEOF", "the file lists distances, or has too many sections"),
+        ("EOF", "A_SECTION\n" * 20 + "EOF", "the file lists distances, or has too many sections"),
+        ("EUC_2D", "GEO", "EDGE_WEIGHT_TYPE is GEO; only EUC_2D can be solved"),
+    ],
+)
+def test_other_oplib_files(old, new, message):
+    pytest.importorskip("vrplib")
+    text = oplib_text(Instances.from_arrays([0, 0], [[1, 2], [3, 4]], [1, 2], 10, 1))
+    with pytest.raises(ValueError, match=message):
+        read_tasks_from_bytes("t.oplib", text.replace(old, new).encode())
+
+
 def test_an_npz_with_everything():
     tasks = read_tasks_from_bytes("t.npz", npz_bytes(whole_problem()), unit="km")
     assert tasks.ids == ("0", "1", "2")
