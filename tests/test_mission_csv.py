@@ -203,7 +203,7 @@ def test_other_columns_are_ignored():
 
 def test_a_depot_beside_a_flagged_row():
     text = "id,lat,lon,depot\na,47,8,x\nb,46,8,\n"
-    assert "a row is the depot already" in refusal(text, depot="47,8")
+    assert "one of the points is the depot already" in refusal(text, depot="47,8")
     assert read(text).depot.tolist() == [47, 8]
 
 
