@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_uav.missions.labels import flies
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.tasks import TaskList
 
@@ -56,7 +57,7 @@ def from_depot(tasks: TaskList, points: np.ndarray) -> np.ndarray:
 def spacing_of(points: np.ndarray) -> float:
     """
     :param points: ``(n, 2)``
-    :return: A distance than which three quarters of the points have no nearer neighbor; 0 with less than 2 points
+    :return: Median of the lengths from every point to the one nearest to it; 0 with less than 2 points
     """
     if len(points) < 2:
         return 0.0
@@ -67,9 +68,9 @@ def spacing_of(points: np.ndarray) -> float:
         lengths = np.hypot(*(block[:, None] - points).transpose(2, 0, 1))
         lengths[np.arange(len(block)), np.arange(start, start + len(block))] = np.inf
         nearest[start : start + 500] = lengths.min(axis=1)
-    return float(np.quantile(nearest, 0.25))
+    return float(np.median(nearest))
 
 
 def _grounded(route: Route, points: np.ndarray) -> np.ndarray:
     """Do not draw a flight to an end that an idle UAV does not fly."""
-    return points[[0, 0]] if not route.stops and route.length_m == 0 else points
+    return points if flies(route) else points[[0, 0]]

@@ -49,6 +49,8 @@
       { mode: text ? "markers+text" : "markers", "marker.size": size, "textfont.size": Math.max(9, Math.round(size * 0.55)) },
       stops,
     );
+    const skipped = of("skipped");
+    if (skipped.length > 0) Plotly.restyle(map, { "marker.size": Math.min(size, 9) }, skipped);
     const tours = of("tour");
     const arrows = tours.map((index) => map.data[index].x.map((_, point) => (text && point % 2 ? arrow : 0)));
     Plotly.restyle(map, { "marker.size": arrows }, tours);
