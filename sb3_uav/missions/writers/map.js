@@ -52,7 +52,7 @@
     Plotly.restyle(map, {
       mode: map.data.map(({ meta }) => modes[meta.role]),
       "marker.size": map.data.map(({ meta }) => sizes[meta.role]),
-      "textfont.size": map.data.map(({ meta }) => (meta.role === "stops" ? Math.max(9, Math.round(size * 0.55)) : undefined)),
+      "textfont.size": map.data.map(({ meta }) => (meta.role === "stops" ? Math.max(8, Math.round(size * 0.55)) : undefined)),
     });
   }
 
@@ -129,7 +129,9 @@
     responsive: true,
     scrollZoom: true,
     displaylogo: false,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    plotlyServerURL: "",
+    // Those that plotly adds by itself differ between its versions, and some share the figure with a service.
+    modeBarButtons: [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
     toImageButtonOptions: { filename: "map", scale: 2 },
   };
   Plotly.newPlot(map, data, layout, config).then(() => {

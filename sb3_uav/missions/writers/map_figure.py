@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # Pixels: stops with and without a number in them, and how much of the distance between two stops one may fill.
-LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 14.0, 0.9
+LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 12.0, 0.9
 # Tasks that are left out must not outshine the stops.
 LARGEST_SKIPPED = 9.0
 _ARROW, _ARROW_AT = 13.0, 0.56
