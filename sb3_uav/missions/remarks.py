@@ -28,7 +28,7 @@ def remarks_on(plan: Plan, flight: FlightOptions | None = None) -> tuple[str, ..
     """
     remarks = [*_of_tasks(plan), *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
     if flight is not None:
-        remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight)]
+        remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight), *_of_return(plan, flight)]
     return (*remarks, REVIEW)
 
 
@@ -57,7 +57,7 @@ def _of_fleet(plan: Plan) -> list[str]:
     speeds = {uav.speed_mps for uav in plan.fleet if uav.speed_mps is not None}
     if len(speeds) > 1 and (plan.tasks.service_s > 0).any():
         remarks.append(
-            f"Speeds differ: a second of service costs every UAV {max(speeds):g} m of its range, what the fastest flies in it; "
+            f"Speeds differ: a second of service costs every UAV {max(speeds):g} m of its range, what the fastest flies; "
             f"slower ones are charged too much, never too little."
         )
     return remarks
@@ -73,9 +73,7 @@ def _of_lengths(plan: Plan) -> list[str]:
     if plan.tasks.system == "wgs84":
         coordinates = plan.tasks.coordinates()
         legs = np.concatenate([route.legs_m for route in plan.routes])
-        in_plane = np.concatenate(
-            [np.hypot(*np.diff(coordinates.to_plane(route.points), axis=0).T) for route in plan.routes]
-        )
+        in_plane = np.concatenate([np.hypot(*np.diff(coordinates.to_plane(route.points), axis=0).T) for route in plan.routes])
         flown = legs > 0
         distortion = float((in_plane[flown] / legs[flown]).max(initial=1.0) - 1.0)
         if distortion > _DISTORTION:
@@ -135,3 +133,19 @@ def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
     if not high:
         return []
     return [f"Above 120 m, which many countries do not allow without a permit: {named(high)}."]
+
+
+def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
+    """
+    Autopilots return at an altitude of their own, where that is higher: see RTL_RETURN_ALT of
+    https://docs.px4.io/main/en/flight_modes/return.html and RTL_ALT of https://ardupilot.org/copter/docs/rtl-mode.html.
+    """
+    flying = [number for number, route in enumerate(plan.routes) if route.length_m > 0]
+    if plan.tasks.system != "wgs84" or flight.landing != "rtl" or len(flying) < 2:
+        return []
+    name = "RTL_RETURN_ALT" if flight.firmware == "px4" else "RTL_ALT"
+    lowest = min(flight.altitude_of(number) for number in flying)
+    return [
+        f"UAVs below the return altitude of their autopilot ({name}) climb to it on the way back; set it to {lowest:g} m or "
+        f"less, or their legs home are at one altitude."
+    ]

@@ -23,9 +23,7 @@ from sb3_uav.missions.writers.summary import FORMAT, SUMMARY_FILE, write_summary
 _TEMPORARY = ".sb3-uav-"
 
 
-def write_mission(
-    plan: Plan, folder: str | Path, flight: FlightOptions | None = None, overwrite: bool = False
-) -> list[Path]:
+def write_mission(plan: Plan, folder: str | Path, flight: FlightOptions | None = None, overwrite: bool = False) -> list[Path]:
     """
     Check the plan once more and write everything that is made of it: ``mission.json``, ``routes.csv``, ``routes.geojson``,
     ``map.png``, ``map.html``, ``summary.json``, and for latitudes and longitudes ``routes.kml``, a ``.plan`` and a

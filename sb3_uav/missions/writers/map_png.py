@@ -44,7 +44,7 @@ def write_map_png(plan: Plan, path: Path) -> None:
 def map_figure(plan: Plan) -> Any:
     """
     :param plan: The plan
-    :return: A matplotlib figure in meters, north up: the depot, tours in colors, numbered stops, skipped tasks hollow by reason
+    :return: A matplotlib figure in meters, north up: the depot, tours in colors, numbered stops, skipped tasks hollow
     :raises ImportError: If matplotlib is not installed
     """
     to_plane = plan.tasks.coordinates().to_plane
