@@ -29,6 +29,7 @@ class TaskList:
     :param places: Where in the file every task stands, such as ``"row 7"``, for messages
     :param source: Name of the file, for messages
     :param sha256: Digest of the file in hexadecimal digits; empty if there is none
+    :param notes: What the file says and the tasks do not, a sentence each
     """
 
     ids: tuple[str, ...]
@@ -44,6 +45,7 @@ class TaskList:
     places: tuple[str, ...] = ()
     source: str = "tasks"
     sha256: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.altitudes) != len(self.ids):
