@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from sb3_uav.evaluation.table import require_rich
+from sb3_uav.missions.labels import count, meters, number, percent, shown
 from sb3_uav.missions.plan import Plan, Reason
 from sb3_uav.missions.remarks import named
 
@@ -40,7 +41,7 @@ def print_plan(plan: Plan, files: Sequence[Path], console: Any = None) -> None:
     tasks = plan.tasks
     write(
         f"{plan.n_served} of {len(tasks)} tasks served, value {plan.objective:g} of {tasks.values.sum():g}, "
-        f"{_length(plan.length_m)} flown"
+        f"{meters(plan.length_m)} flown"
         + (
             f", at most {plan.bound:g} possible (gap {plan.gap:.1%})"
             if plan.bound is not None and plan.gap is not None
@@ -53,7 +54,7 @@ def print_plan(plan: Plan, files: Sequence[Path], console: Any = None) -> None:
         skipped = [skipped for skipped in plan.skipped if skipped.reason == reason]
         if skipped:
             names = named([_missing(plan, one.task, one.missing_m) for one in skipped])
-            write(f"{_counted(len(skipped), 'task')} skipped, {reason}: {names}")
+            write(f"{count(len(skipped), 'task')} skipped, {reason}: {names}")
     if plan.n_served == 0:
         write(f"The plan is empty: {why_empty(plan)}", "bold red")
     for remark in plan.remarks:
@@ -73,10 +74,16 @@ def why_empty(plan: Plan) -> str:
     if not near:
         return "every task is worth nothing."
     best = min(near, key=lambda skipped: skipped.missing_m or 0.0)
-    name, missing = plan.tasks.ids[best.task], best.missing_m or 0.0
+    name, missing = shown(plan.tasks.ids[best.task]), best.missing_m or 0.0
     if best.reason == "did not fit":
         return f"the solver found no route, though task {name} alone is in reach; give it more time or choose another."
     return f"all tasks are out of reach; the nearest, {name}, needs {_exactly(missing)} more range than any UAV may use."
+
+
+def _proof(plan: Plan) -> str:
+    if plan.bound is None or plan.gap is None:
+        return ""
+    return f"; proven bound {number(plan.bound)}, gap {100 * max(plan.gap, 0.0):.1f} %"
 
 
 def _table(rich: Any, plan: Plan) -> Any:
@@ -88,24 +95,16 @@ def _table(rich: Any, plan: Plan) -> Any:
     for heading in (*columns, *(["Reserve"] if keeps_reserve else []), *(["Time"] if is_timed else [])):
         table.add_column(heading, justify="right", no_wrap=True)
     for route in plan.routes:
-        cells = [str(len(route.stops)), _length(route.length_m), _length(route.used_m), f"{route.share_of_range:.1%}"]
+        cells = [str(len(route.stops)), meters(route.length_m), meters(route.used_m), percent(route.share_of_range)]
         cells += [f"{route.uav.reserve_percent:g} %"] if keeps_reserve else []
         cells += ["-" if route.seconds is None else _time(route.seconds)] if is_timed else []
-        table.add_row(rich.text.Text(route.uav.id), *cells)
+        table.add_row(rich.text.Text(shown(route.uav.id)), *cells)
     return table
 
 
 def _missing(plan: Plan, task: int, missing: float | None) -> str:
-    name = plan.tasks.ids[task]
+    name = shown(plan.tasks.ids[task])
     return name if not missing else f"{name} ({_exactly(missing)} short)"
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" + ("" if number == 1 else "s")
-
-
-def _length(meters: float) -> str:
-    return f"{meters / 1000:.2f} km"
 
 
 def _exactly(meters: float) -> str:
@@ -156,7 +155,7 @@ class Progress:
         """
         :param plan: A better plan than before
         """
-        best = f"{plan.n_served} of {len(plan.tasks)} tasks, value {plan.objective:g}"
+        best = f"{plan.n_served} of {len(plan.tasks)} tasks, value {number(plan.objective)}"
         with self._lock:
             self._best = best
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_uav.missions.crossings import SEPARATION_M, find_crossings
 from sb3_uav.missions.flight import FlightOptions
+from sb3_uav.missions.labels import shown
 from sb3_uav.missions.plan import Plan
 
 REVIEW = "A person must review this plan before it is flown. Wind, terrain, obstacles and no-fly zones are not modeled."
@@ -26,7 +27,7 @@ def remarks_on(plan: Plan, flight: FlightOptions | None = None) -> tuple[str, ..
     :param flight: How it is flown; without it, nothing is said about altitudes
     :return: A sentence for everything that is out of the ordinary, and at the end what no plan takes into account
     """
-    remarks = [*_of_tasks(plan), *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
+    remarks = [*_of_tasks(plan), *plan.tasks.notes, *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
     if flight is not None:
         remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight), *_of_return(plan, flight)]
     return (*remarks, REVIEW)
@@ -36,17 +37,17 @@ def named(names: Sequence[str], most: int = _MAX_NAMED) -> str:
     """
     :param names: Names
     :param most: How many to write out
-    :return: The first ones, and how many more there are
+    :return: The first ones, fit to be printed, and how many more there are
     """
     more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+    return ", ".join(map(shown, names[:most])) + (f" and {more} more" if more > 0 else "")
 
 
 def _of_tasks(plan: Plan) -> list[str]:
     if not plan.unserved:
         return []
     names = named([plan.tasks.ids[task] for task in plan.unserved])
-    return [f"Of the tasks that must be served, {len(plan.unserved)} are not: {names}."]
+    return [f"Not served, though it must be: {names}."]
 
 
 def _of_fleet(plan: Plan) -> list[str]:
@@ -68,7 +69,8 @@ def _of_lengths(plan: Plan) -> list[str]:
     longest = max(plan.routes, key=lambda route: route.legs_m.max())
     if longest.legs_m.max() > _LONG_LEG_M:
         remarks.append(
-            f"A leg of UAV {longest.uav.id} is {longest.legs_m.max() / 1000:.0f} km long; check coordinates, units and ranges."
+            f"A leg of UAV {shown(longest.uav.id)} is {longest.legs_m.max() / 1000:.0f} km long; check coordinates, units and "
+            f"ranges."
         )
     if plan.tasks.system == "wgs84":
         coordinates = plan.tasks.coordinates()
@@ -97,7 +99,7 @@ def _of_launches(plan: Plan) -> list[str]:
         routes = [plan.routes[number] for number in uavs]
         is_timed = all(route.seconds is not None for route in routes)
         longest_first = sorted(routes, key=lambda route: -((route.seconds or 0.0) if is_timed else route.used_m))
-        order = ", ".join(route.uav.id for route in longest_first[: 2 * _MAX_NAMED])
+        order = ", ".join(shown(route.uav.id) for route in longest_first[: 2 * _MAX_NAMED])
         more = len(routes) - 2 * _MAX_NAMED
         measure = "longest time in the air" if is_timed else "longest route"
         place = "" if len(at_place) == 1 else f" at {', '.join(f'{x:g}' for x in routes[0].points[0])}"

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.missions.labels import count, number, route_facts, shown, uav_color, uav_style
 from sb3_uav.missions.plan import Plan, Reason, Route
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
-from sb3_uav.plots.style import LINE_STYLES, SERIES_COLORS
+from sb3_uav.plots.style import LINE_STYLES
 
 _WIDTH = 8.0
 # Inches of the map: between a strip and a tower.
@@ -68,8 +69,8 @@ def map_figure(plan: Plan) -> Any:
     if depot is not None:
         axes.scatter(*depot, marker="s", s=65, color="black", zorder=6, label="depot")
     taken: list[np.ndarray] = []
-    for number, (route, path) in enumerate(zip(plan.routes, paths, strict=True)):
-        _draw_route(axes, plan, number, route, path, size)
+    for uav, (route, path) in enumerate(zip(plan.routes, paths, strict=True)):
+        _draw_route(axes, plan, uav, route, path, size)
     for route, path in zip(plan.routes, paths, strict=True):
         _number_stops(axes, path[1:-1] if route.stops else path[:0], points_per_meter, taken)
     if plan.tasks.must.any():
@@ -77,8 +78,8 @@ def map_figure(plan: Plan) -> Any:
     _draw_skipped(axes, plan, tasks, size, (low, high))
     _draw_scale(axes, low, high, "N" if plan.tasks.system == "wgs84" else "y")
     axes.set_title(
-        f"{Path(plan.tasks.source).name}: {plan.n_served} of {len(plan.tasks)} tasks served, "
-        f"value {plan.objective:g} of {plan.tasks.values.sum():g}",
+        f"{shown(Path(plan.tasks.source).name)}: {plan.n_served:,} of {count(len(plan.tasks), 'task')} served, "
+        f"value {number(plan.objective)} of {number(float(plan.tasks.values.sum()))}",
         fontsize=10,
         loc="left",
         parse_math=False,
@@ -124,15 +125,11 @@ def _draw_skipped(axes: Any, plan: Plan, tasks: np.ndarray, size: float, view: t
         axes.scatter(*tasks[unserved].T, **star, label=f"{len(unserved)} not served that must be")
 
 
-def _draw_route(axes: Any, plan: Plan, number: int, route: Route, path: np.ndarray, size: float) -> None:
-    color = SERIES_COLORS[number % len(SERIES_COLORS)]
-    style = LINE_STYLES[number // len(SERIES_COLORS) % len(LINE_STYLES)]
-    label = (
-        f"{route.uav.id}: {len(route.stops)} stop{'' if len(route.stops) == 1 else 's'}, {route.length_m / 1000:.2f} km, "
-        f"{route.share_of_range:.0%} of its range"
-    )
-    if number >= _MAX_NAMED:
-        label = f"{len(plan.routes) - _MAX_NAMED} more UAVs" if number == _MAX_NAMED else "_nolegend_"
+def _draw_route(axes: Any, plan: Plan, uav: int, route: Route, path: np.ndarray, size: float) -> None:
+    color, style = uav_color(uav), LINE_STYLES[uav_style(uav) % len(LINE_STYLES)]
+    label = f"{shown(route.uav.id)}: {route_facts(route)}"
+    if uav >= _MAX_NAMED:
+        label = f"{len(plan.routes) - _MAX_NAMED} more UAVs" if uav == _MAX_NAMED else "_nolegend_"
     flown = path if route.length_m > 0 else path[:0]
     axes.plot(*flown.T, color=color, linestyle=style, linewidth=1.2, zorder=3, label=label)
     must = plan.tasks.must[list(route.stops)]
