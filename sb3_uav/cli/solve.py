@@ -49,6 +49,7 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     of_tasks.add_argument("--unit", help="unit of x and y, such as m, km or ft, if the file does not say")
     of_tasks.add_argument("--allow-duplicates", action="store_true", help="several tasks may be at one place")
+    of_tasks.add_argument("--row", type=int, metavar="N", help="which instance of an .npz with several, from 0")
     add_fleet_options(parser)
     search = parser.add_argument_group("search")
     search.add_argument("--solver", metavar="SPEC", help="as for sb3-uav evaluate (default: the trained pair, repair, polish)")
@@ -135,7 +136,6 @@ def main(argv: Sequence[str]) -> int:
     from sb3_uav.missions.fleet_options import FleetOptions
     from sb3_uav.missions.read import read_tasks
     from sb3_uav.missions.search import solve
-    from sb3_uav.missions.units import parse_point
     from sb3_uav.missions.write import check_folder, checked, write_mission
 
     # What may be missing or wrong is found before the long run, not after it.
@@ -146,8 +146,9 @@ def main(argv: Sequence[str]) -> int:
         raise ValueError(f"--time-limit is {args.time_limit:g}; give a number of seconds above 0.")
     flight = flight_of(args)
     check_folder(args.out, args.overwrite)
-    depot = None if args.depot is None else parse_point(args.depot)
-    tasks = read_tasks(args.tasks, unit=args.unit, depot=depot, allow_duplicates=args.allow_duplicates)
+    tasks = read_tasks(
+        args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row
+    )
     options = FleetOptions(args.fleet, args.uavs, args.range, args.endurance, args.speed, args.reserve)
     fleet = options.fleet(tasks)
     with Progress(args.time_limit) as progress:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from sb3_uav.missions.coordinates import System
+
 
 @dataclass(frozen=True)
 class Uav:
@@ -37,11 +39,13 @@ class Fleet:
     """
     :param uavs: The UAVs, at least one
     :param source: Name of the file, for messages
+    :param system: Coordinates of their starts and ends, if the file says which; those of the tasks when None
     :param sha256: Digest of the file in hexadecimal digits; empty if there is none
     """
 
     uavs: tuple[Uav, ...]
     source: str = "fleet"
+    system: System | None = None
     sha256: str = ""
 
     def __len__(self) -> int:
