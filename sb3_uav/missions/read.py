@@ -198,7 +198,7 @@ def _content_format(data: bytes) -> Format:
         return "qgc-plan" if _IS_PLAN.search(text) else "geojson"
     if text.startswith(b"QGC WPL"):
         return "wpl"
-    if re.search(rb"^\s*NODE_COORD_SECTION", data, re.MULTILINE):
+    if re.search(rb"^[ \t]*(?:NODE_COORD|NODE_SCORE|EDGE_WEIGHT)_SECTION", data, re.MULTILINE):
         return "oplib"
     if re.match(rb"n[ \t]+\d+[ \t]*[\r\n]", text):
         return "chao"

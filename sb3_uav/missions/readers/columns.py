@@ -125,8 +125,10 @@ def _check_spelling(name: str, title: str, missing: Sequence[Field], source: str
         base = next((synonym for synonym in field.synonyms if name.startswith(f"{synonym}_")), None)
         if base is not None and field.units:
             # The first spelling of each.
-            spelled = {factor: unit for unit, factor in reversed(field.units.items())}
-            units = ", ".join(f"{base}_{unit}" for unit in reversed(spelled.values()))
+            spelled: dict[float, str] = {}
+            for unit, factor in field.units.items():
+                spelled.setdefault(factor, f"{base}_{unit}")
+            units = ", ".join(spelled.values())
             raise ValueError(
                 f"{source}: column {title!r:.60}: {name[len(base) + 1 :]!r:.40} is no known unit; use {units}, or remove it."
             )
@@ -221,8 +223,8 @@ class Cells:
         row, column, text = commas[0]
         for other, with_point, number in self._numbers("."):
             raise ValueError(
-                f"{self.where(row)}: {column.title} is {text!r:.60}, but {with_point.title} in row {self.table.rows[other][0]} "
-                f"is {number!r:.60}; use either commas or points for decimals in the whole file."
+                f"{self.where(row)}: {column.title} is {text!r:.60}, but row {self.table.rows[other][0]} has {number!r:.60} "
+                f"as {with_point.title}; use either commas or points for decimals in the whole file."
             )
         if all(_GROUPED.fullmatch(text) and not column.field.is_degrees for _, column, text in commas):
             dotted, whole = text.replace(",", "."), text.replace(",", "")

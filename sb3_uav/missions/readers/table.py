@@ -10,6 +10,10 @@ from dataclasses import dataclass
 
 DELIMITERS = (",", ";", "\t")
 _MOST_COLUMNS = 1_000
+# Blank ones, and those within quotes, are no rows, but take time too.
+_MOST_LINES = 500_000
+_MOST_IN_LINE = 100_000
+_MOST_LINES_OF_RECORD = 100
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
@@ -42,18 +46,22 @@ def decoded(data: bytes, source: str) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # Of what follows the byte order mark.
-        skipped = 3 if data.startswith(b"\xef\xbb\xbf") else 0
-        line = len(re.split(rb"\r\n|\r|\n", data[: skipped + error.start]))
+        # Counted from after the byte order mark.
+        offset = error.start + (3 if data.startswith(b"\xef\xbb\xbf") else 0)
+        row = _n_line_ends(data[:offset].decode("latin-1")) + 1
         raise ValueError(
-            f"{source}: row {line}: byte {data[skipped + error.start]:#04x} at offset {skipped + error.start} is not UTF-8; "
-            "save the file as UTF-8."
+            f"{source}: row {row}: byte {data[offset]:#04x} at offset {offset} is not UTF-8; save the file as UTF-8."
         ) from None
     control = _CONTROL.search(text)
     if control:
-        line = len(re.split(r"\r\n|\r|\n", text[: control.start()]))
-        raise ValueError(f"{source}: row {line}: the file holds the control character {control[0]!r}; remove it.")
+        row = _n_line_ends(text[: control.start()]) + 1
+        raise ValueError(f"{source}: row {row}: the file holds the control character {control[0]!r}; remove it.")
     return text
+
+
+def _n_line_ends(text: str) -> int:
+    """:return: Number of line ends of any kind"""
+    return text.count("\n") + text.count("\r") - text.count("\r\n")
 
 
 def read_table(data: bytes, source: str, known: Sequence[str], most_rows: int, example: str) -> Table:
@@ -72,6 +80,8 @@ def read_table(data: bytes, source: str, known: Sequence[str], most_rows: int, e
     :raises ValueError: If it is empty, no such table, or too large; the message names the row
     """
     text = decoded(data, source)
+    if _n_line_ends(text) > _MOST_LINES:
+        raise ValueError(f"{source}: there are {_n_line_ends(text)} rows, but at most {most_rows} are read; divide the file.")
     delimiter = max(DELIMITERS, key=lambda mark: _rank(text, mark, source, known))
     records = _records(text, delimiter, source)
     line, header = _header(records)
@@ -81,7 +91,7 @@ def read_table(data: bytes, source: str, known: Sequence[str], most_rows: int, e
         del header[-1]
     if len(header) > _MOST_COLUMNS:
         raise ValueError(f"{source}: row {line}: there are {len(header)} columns, but at most {_MOST_COLUMNS} are read.")
-    rows = []
+    rows: list[tuple[int, tuple[str, ...]]] = []
     for line, cells in records:
         if len(rows) == most_rows:
             raise ValueError(f"{source}: row {line}: there are more than {most_rows} rows; divide the file.")
@@ -112,19 +122,55 @@ def _records(text: str, delimiter: str, source: str) -> Iterator[tuple[int, list
     :return: Line where each record begins, and its cells; without those that are empty
     :raises ValueError: If the text is no CSV
     """
-    # Without translation, so that every kind of line ending counts once.
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    lines = _Lines(text, source)
+    reader = csv.reader(lines, delimiter=delimiter, strict=True)
     while True:
-        line = reader.line_num + 1
+        row = lines.begin_record()
         try:
             record = next(reader)
         except StopIteration:
             return
         except csv.Error as error:
-            raise ValueError(f"{source}: row {line}: this is no CSV ({error}); look for a quote that is not closed.") from None
+            raise ValueError(f"{source}: row {row}: this is no CSV ({error}); look for a quote that is not closed.") from None
         cells = [cell.strip() for cell in record]
         if any(cells):
-            yield line, cells
+            yield row, cells
+
+
+class _Lines:
+    """
+    The lines of a text, in bounds that keep every record small.
+
+    :param text: The text
+    :param source: Its name, for errors
+    """
+
+    def __init__(self, text: str, source: str) -> None:
+        # Without translation, so that every kind of line end counts once.
+        self._lines = io.StringIO(text, newline="")
+        self._source = source
+        self._n_read = 0
+        self._record = 1
+
+    def begin_record(self) -> int:
+        """:return: The line where a record begins, from 1"""
+        self._record = self._n_read + 1
+        return self._record
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        line = next(self._lines)
+        self._n_read += 1
+        if len(line) > _MOST_IN_LINE:
+            raise ValueError(f"{self._source}: row {self._n_read}: {len(line)} characters are in the line; is this a CSV?")
+        if self._n_read >= self._record + _MOST_LINES_OF_RECORD:
+            raise ValueError(
+                f"{self._source}: row {self._record}: more than {_MOST_LINES_OF_RECORD} lines are in quotes; look for a quote "
+                "that is not closed."
+            )
+        return line
 
 
 def _fitted(cells: list[str], n_columns: int, delimiter: str, where: str) -> tuple[str, ...]:
