@@ -68,3 +68,9 @@ class Fleet:
         """
         uavs = (Uav(f"uav-{n}", range_m, speed_mps, reserve_percent=reserve_percent) for n in range(1, n_uavs + 1))
         return cls(tuple(uavs), source)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from sb3_uav.missions.drawing import fleet_html
+
+        return fleet_html(self)
