@@ -85,6 +85,8 @@ class Plan:
     :param seed: Seed of the solver
     :param seconds: Wall time of the solver
     :param bound: A proven upper bound of the objective; None if there is none
+    :param past_tasks: Names of tasks that earlier plans of this mission had, done or dropped since
+    :param past_uavs: Names of UAVs that earlier plans had, lost since
     :param remarks: What a person should know before flying it, a sentence each
     """
 
@@ -98,6 +100,8 @@ class Plan:
     seed: int
     seconds: float
     bound: float | None = None
+    past_tasks: tuple[str, ...] = ()
+    past_uavs: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
     @property

@@ -39,6 +39,7 @@ from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.status import KINDS, NewTask, RemainingUnit, Status, UavReport
 
 _MAX_BYTES = 10 * 2**20
+_MAX_ROWS = 100_000
 _MAX_NAME = 200
 # Other names of columns.
 _ALIASES = {
@@ -250,6 +251,8 @@ def _rows(data: bytes, source: str) -> tuple[list[tuple[int, _Row]], set[str]]:
     if not numbered:
         raise ValueError(f"{source}: the file is empty; its first row names the columns, such as what,id,lat,lon,remaining_m.")
     (first, header), *others = numbered
+    if len(others) > _MAX_ROWS:
+        raise ValueError(f"{source}: there are {len(others)} rows; {_MAX_ROWS} are the most.")
     columns = _column_names(header, f"{source}: row {first}")
     rows = []
     for number, cells in others:
