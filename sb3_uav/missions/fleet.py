@@ -39,10 +39,12 @@ class Fleet:
     """
     :param uavs: The UAVs, at least one
     :param source: Name of the file, for messages
+    :param sha256: Digest of the file in hexadecimal digits; empty if there is none
     """
 
     uavs: tuple[Uav, ...]
     source: str = "fleet"
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.uavs)
