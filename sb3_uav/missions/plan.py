@@ -89,6 +89,7 @@ class Plan:
     :param bound: A proven upper bound of the objective; None if there is none
     :param past_tasks: Names of tasks that earlier plans of this mission had, done or dropped since
     :param past_uavs: Names of UAVs that earlier plans had, lost since
+    :param notes: What had to be assumed in making it, a sentence each; remarks begin with them
     :param remarks: What a person should know before flying it, a sentence each
     :param time_limit: Seconds that the solver was given; None if nobody said
     """
@@ -105,6 +106,7 @@ class Plan:
     bound: float | None = None
     past_tasks: tuple[str, ...] = ()
     past_uavs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     time_limit: float | None = None
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from sb3_uav.common.optional import require
-from sb3_uav.envs.distances import DISTANCE_TOLERANCE
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule, check_schedule
+from sb3_uav.missions.old_routes import OldRoutes
 from sb3_uav.missions.plan import Plan
 from sb3_uav.missions.problem import make_instance
+from sb3_uav.missions.remarks import remarks_on
 from sb3_uav.missions.search import make_plan
 from sb3_uav.missions.situation import Situation, situation_of
 from sb3_uav.missions.status import Status
@@ -37,6 +38,7 @@ class Replanned:
     :param n_remaining: Legs of the old plan that were left to fly: those of UAVs that still fly, from where they are over
         their stops that are left to their end. Legs from or to a stop that is done or dropped do not count
     :param method: How the plan came about
+    :param unchanged: Names of UAVs that fly what was left of their routes, and nothing else
     :param added: Names of new tasks
     :param gone: Names of tasks that are done or dropped
     :param freed: Names of tasks that were planned for a UAV that is lost
@@ -49,6 +51,7 @@ class Replanned:
     n_kept: int
     n_remaining: int
     method: Method
+    unchanged: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
     freed: tuple[str, ...] = ()
@@ -91,38 +94,60 @@ def replan(plan: Plan, status: Status, time_limit: float = DEFAULT_SECONDS, seed
     require("numba", "Replanning", "missions")
     start = time.perf_counter()
     now = situation_of(plan, status)
+    legs = _legs_to_fly(plan, now)
     if not now.is_news:
-        n_legs = len(_legs_to_fly(plan, now))
-        return Replanned(plan, n_legs, n_legs, "kept", remarks=now.remarks)
+        everybody = tuple(uav.id for uav in plan.fleet)
+        return Replanned(plan, len(legs), len(legs), "kept", everybody, remarks=now.remarks)
     if not any(uav.usable_m > 0 for uav in now.fleet):
         raise ValueError(f"{status.source}: no UAV has any range left beyond its reserve, so there is nothing to plan.")
     instance = make_instance(now.tasks, now.fleet)
-    residual = _fitting(instance, now.routes)
-    schedule, method = _least_disruptive(instance, residual, time_limit, seed, min_gain)
+    chosen = _least_disruptive(instance, OldRoutes(instance, now.routes), time_limit, seed, min_gain)
     seconds = time.perf_counter() - start
-    new = make_plan(now.tasks, now.fleet, schedule, f"replan:{method}", seed, seconds, instance)
+    new = make_plan(now.tasks, now.fleet, chosen.schedule, f"replan:{chosen.method}", seed, seconds, instance)
+    n_kept = len(legs & _legs_of(new))
+    notes = (*now.remarks, *_of_legs(n_kept, len(legs)), *_of_gain(chosen, new))
     new = replace(
         new,
         past_tasks=tuple(dict.fromkeys((*plan.past_tasks, *now.gone, *_never_planned(now, status)))),
         past_uavs=(*plan.past_uavs, *now.lost),
-        remarks=(*now.remarks, *new.remarks),
+        time_limit=time_limit,
+        notes=notes,
     )
-    legs = _legs_to_fly(plan, now)
-    served = {now.tasks.ids[task] for route in schedule.routes for task in route}
+    new = replace(new, remarks=remarks_on(new))
+    served = {now.tasks.ids[task] for route in new.routes for task in route.stops}
     planned = {route.uav.id: [plan.tasks.ids[task] for task in route.stops] for route in plan.routes}
     left = set(now.tasks.ids)
     return Replanned(
         new,
-        len(legs & _legs_of(new)),
+        n_kept,
         len(legs),
-        method,
+        chosen.method,
+        tuple(route.uav.id for route, old in zip(new.routes, now.routes, strict=True) if route.stops == old),
         now.added,
         now.gone,
         tuple(name for uav in now.lost for name in planned[uav] if name in left),
         tuple(name for stops in planned.values() for name in stops if name in left and name not in served),
         now.lost,
-        now.remarks,
+        notes,
     )
+
+
+def _of_legs(n_kept: int, n_remaining: int) -> list[str]:
+    """:return: A note on how much is kept"""
+    if n_remaining == 0:
+        return []
+    return [f"{n_kept} of the {n_remaining} legs that were left to fly are kept ({n_kept / n_remaining:.0%})."]
+
+
+def _of_gain(chosen: _Choice, plan: Plan) -> list[str]:
+    """:return: A note on what has been gained by changing routes further, if they have been"""
+    if chosen.method not in ("repair", "search"):
+        return []
+    gained = [f"a value of {plan.objective:g} in place of {chosen.calm_value:g}"]
+    if len(plan.unserved) < chosen.calm_unserved:
+        more = chosen.calm_unserved - len(plan.unserved)
+        gained.insert(0, f"{more} more {'task' if more == 1 else 'tasks'} that must be served")
+    return [f"Routes are changed further than tasks between stops that stay would do, for {' and '.join(gained)}."]
 
 
 def _never_planned(now: Situation, status: Status) -> list[str]:
@@ -159,46 +184,28 @@ def _legs_of(plan: Plan) -> _Legs:
     return legs
 
 
-def _fitting(instance: Instances, routes: Sequence[Sequence[int]]) -> Schedule:
+class _Choice(NamedTuple):
     """
-    :param instance: A batch of one
-    :param routes: One route per UAV
-    :return: The routes without the stops that are worth least for what they take, those that must be served last, until every
-        UAV can fly its own
+    :param schedule: A schedule
+    :param method: How it came about
+    :param calm_unserved: How many tasks that must be served are not, in the schedule that changes least
+    :param calm_value: Value of that schedule
     """
-    points, service, values = (field[0].tolist() for field in (instance.tasks, instance.service_cost, instance.values))
-    must = [False] * len(points) if instance.must_serve is None else instance.must_serve[0].tolist()
-    starts, ends, limits = (field[0].tolist() for field in (instance.uav_start, instance.uav_end, instance.uav_distance))
-    fitting = []
-    for start, end, limit, route in zip(starts, ends, limits, routes, strict=True):
-        stops, limit = list(route), limit + DISTANCE_TOLERANCE * limit
-        if math.dist(start, end) > limit:
-            stops = []
-        while stops:
-            way = [start, *(points[task] for task in stops), end]
-            legs = [math.hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairwise(way)]
-            if sum(legs) + math.fsum(service[task] for task in stops) <= limit:
-                break
-            saved = [
-                legs[place] + legs[place + 1] - math.dist(way[place], way[place + 2]) + service[task]
-                for place, task in enumerate(stops)
-            ]
-            worth = [(must[task], values[task] / max(saving, 1e-9)) for task, saving in zip(stops, saved, strict=True)]
-            del stops[worth.index(min(worth))]
-        fitting.append(stops)
-    return Schedule(fitting)
+
+    schedule: Schedule
+    method: Method
+    calm_unserved: int
+    calm_value: float
 
 
-def _least_disruptive(
-    instance: Instances, residual: Schedule, time_limit: float, seed: int, min_gain: float
-) -> tuple[Schedule, Method]:
+def _least_disruptive(instance: Instances, old: OldRoutes, time_limit: float, seed: int, min_gain: float) -> _Choice:
     """
     :param instance: A batch of one
-    :param residual: What is left of the routes, feasible
+    :param old: What is left of the routes
     :param time_limit: As of :func:`replan`
     :param seed: As of :func:`replan`
     :param min_gain: As of :func:`replan`
-    :return: Of several schedules the one that changes least, unless another one serves more; and how it came about
+    :return: Of several schedules the one that changes least, unless another one serves more
     """
     from sb3_uav.local_search.search import LocalSearch
 
@@ -207,23 +214,23 @@ def _least_disruptive(
         return -len(report.unserved), report.objective
 
     start = time.perf_counter()
-    search = LocalSearch(instance)
-    best: tuple[Schedule, Method] = residual, "kept"
+    search, residual = LocalSearch(instance), old.fitting()
     inserted = search.insertion(residual)
-    if rank(inserted) > rank(residual):
-        best = inserted, "insertion"
-    if best[0].n_visited >= np.count_nonzero(instance.prizes[0].numpy() > 0):
-        return best
-
-    def offer(schedule: Schedule, method: Method) -> None:
-        nonlocal best
-        (unserved, value), (least, old) = rank(schedule), rank(best[0])
-        if (unserved, value) > (least, old) and (unserved > least or value > old * (1.0 + min_gain / 100.0)):
-            best = schedule, method
-
-    repaired = search.repair(inserted, time_limit or None)
-    offer(repaired, "repair")
-    left = time_limit - (time.perf_counter() - start)
-    if left > 0:
-        offer(search.improve(repaired, left, seed), "search")
-    return best
+    calm: tuple[Schedule, Method] = (inserted, "insertion") if rank(inserted) > rank(residual) else (residual, "kept")
+    best, unserved, value = calm, *rank(calm[0])
+    further: list[tuple[Method, Callable[[Schedule, float], Schedule]]] = [
+        ("repair", lambda given, left: search.repair(given, left if time_limit > 0 else None)),
+        ("search", lambda given, left: search.improve(given, left, seed)),
+    ]
+    found, n_useful = inserted, np.count_nonzero(instance.prizes[0].numpy() > 0)
+    for method, change in further:
+        left = time_limit - (time.perf_counter() - start)
+        if best[0].n_visited >= n_useful or (left <= 0 and method == "search"):
+            break
+        found = change(found, left)
+        new_unserved, new_value = rank(found)
+        if new_unserved > unserved or (new_unserved == unserved and new_value > value * (1.0 + min_gain / 100.0)):
+            best, unserved, value = (found, method), new_unserved, new_value
+    least, calm_value = rank(calm[0])
+    schedule, method = best
+    return _Choice(old.in_old_order(schedule), method, -least, calm_value)

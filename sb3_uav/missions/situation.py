@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.plan import Plan, Route
-from sb3_uav.missions.problem import service_speed
+from sb3_uav.missions.remarks import named
 from sb3_uav.missions.status import Status, UavReport
 from sb3_uav.missions.status_checks import check_status, full_range, remaining_range
 from sb3_uav.missions.tasks import TaskList
@@ -59,20 +59,26 @@ def situation_of(plan: Plan, status: Status) -> Situation:
     uavs, remarks, silent = [], [], []
     for route in left:
         report = reports.get(route.uav.id)
-        uav, words = _now(plan, route, report, status)
+        uav, words = (route.uav, []) if report is None else _now(plan, route, report)
         uavs.append(uav)
         remarks += words
-        if report is None and uav is route.uav:
+        if report is None:
             silent.append(uav.id)
+            behind = [name for name in _names(plan, route) if name in status.done]
+            if behind:
+                remarks.append(
+                    f"UAV {uav.id} has not reported, though of its route are done: {named(behind)}. If it is in the air, "
+                    f"give a row uav with its place and the range that it has."
+                )
     if silent:
-        remarks.append(f"Not in the status, and so taken to be where their routes begin: {', '.join(silent)}.")
+        remarks.append(
+            f"Not in the status, and so taken to be where their routes begin, with the range planned there: {named(silent)}."
+        )
     gone = tuple(name for name in plan.tasks.ids if name not in number)
     lost = tuple(uav.id for uav in plan.fleet if uav.id in status.lost)
     followers = [uav.id for place, uav in enumerate(uavs) if plan.fleet.uavs[place].id != uav.id]
     if followers:
-        remarks.append(
-            f"Altitude steps are counted anew without {', '.join(lost)}; check the altitude of {', '.join(followers)}."
-        )
+        remarks.append(f"Altitude steps are counted anew without {named(lost)}; check the altitude of {named(followers)}.")
     return Situation(
         tasks,
         replace(plan.fleet, uavs=tuple(uavs)),
@@ -109,28 +115,15 @@ def _open_tasks(plan: Plan, status: Status) -> tuple[TaskList, tuple[str, ...]]:
     return tasks, tuple(task.id for task in new)
 
 
-def _now(plan: Plan, route: Route, report: UavReport | None, status: Status) -> tuple[Uav, list[str]]:
+def _now(plan: Plan, route: Route, report: UavReport) -> tuple[Uav, list[str]]:
     """
     :param plan: The plan
     :param route: The planned route of a UAV
     :param report: What the UAV reports
-    :param status: All that has happened
     :return: The UAV where it is and with the range that it has, the same object if that is as planned; and remarks
     """
-    uav, tasks, remarks = route.uav, plan.tasks, []
-    position, remaining = (None, None) if report is None else (report.position, remaining_range(route.uav, report))
-    behind = [place for place, name in enumerate(_names(plan, route), 1) if name in status.done]
-    if behind and position is None:
-        stops = list(route.stops[: behind[-1]])
-        position = (float(tasks.points[stops[-1], 0]), float(tasks.points[stops[-1], 1]))
-        words = (
-            f"UAV {uav.id} does not say where it is; it is taken to be at {tasks.ids[stops[-1]]}, its last task that is done"
-        )
-        if remaining is None:
-            service = math.fsum(tasks.service_s[stops]) * service_speed(tasks, plan.fleet)
-            remaining = max(uav.range_m - math.fsum(route.legs_m[: len(stops)]) - service, 0.0)
-            words += f", with the {remaining:.0f} m that the plan leaves it there"
-        remarks.append(f"{words}.")
+    uav, position, remarks = route.uav, report.position, []
+    remaining = remaining_range(uav, report)
     remaining = uav.range_m if remaining is None else remaining
     if remaining > full_range(uav):
         remarks.append(
@@ -149,7 +142,7 @@ def _now(plan: Plan, route: Route, report: UavReport | None, status: Status) -> 
         reserve_percent=min(100.0 * reserve / remaining, 100.0) if remaining > 0 else uav.reserve_percent,
         full_range_m=full_range(uav),
     )
-    return _homeward(tasks, uav, route.points[-1], remarks) if has_moved else (uav, remarks)
+    return _homeward(plan.tasks, uav, route.points[-1], remarks) if has_moved else (uav, remarks)
 
 
 def _homeward(tasks: TaskList, uav: Uav, end: Sequence[float], remarks: list[str]) -> tuple[Uav, list[str]]:

@@ -20,7 +20,7 @@ class UavReport:
     Where a UAV is, and how far it still flies.
 
     :param id: Name of the UAV
-    :param position: Where it is, in the user's coordinates; where its route begins, or at its last stop that is done, if None
+    :param position: Where it is, in the user's coordinates; where its route begins if None
     :param remaining: How far it still flies down to an empty battery, reserve included; as planned if None
     :param unit: Unit of that: meters, percent of its whole range, or minutes at cruise speed
     """

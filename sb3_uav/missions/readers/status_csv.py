@@ -14,7 +14,7 @@ One CSV file with rows of five kinds, in any order::
 
 - ``uav``: where a UAV is and how far it still flies: ``remaining_m`` (meters), ``remaining_percent`` (of its whole range) or
   ``remaining_min`` (minutes at cruise speed), down to an empty battery. The reserve is kept off it later. Without ``lat`` and
-  ``lon`` it is where its route begins, or at its last stop that is done.
+  ``lon`` it is where its route begins.
 - ``done``: a task that is done, by whomever.
 - ``lost``: a UAV that flies no more. Its tasks are free again.
 - ``task``: a new task. ``value`` is 1, ``service_s`` 0 and ``must`` no where nothing stands.
@@ -22,7 +22,7 @@ One CSV file with rows of five kinds, in any order::
 
 Plans in a plane have ``x`` and ``y`` in place of ``lat`` and ``lon``. Columns may stand in any order, and those that no row
 needs may be missing; a column ``note`` is for people. Rows of ``done``, ``lost`` and ``drop`` need a name only. What no row
-names is as planned.
+names is as planned: a UAV without a row is where its route begins.
 """
 
 from __future__ import annotations
