@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -180,21 +181,11 @@ def test_flight_options_reach_the_files(tasks_csv: Path) -> None:
     assert (missions[0]["firmwareType"], missions[0]["vehicleType"], missions[0]["items"][-1]["command"]) == (3, 1, 21)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "fleet", "n_tasks", "least"),
-    [
-        ("orchard.csv", ("--uavs", "2", "--endurance", "18min", "--speed", "8m/s", "--reserve", "20"), 120, 108),
-        ("city.geojson", ("--fleet", str(EXAMPLES / "city_fleet.csv")), 400, 180),
-        ("lattice.csv", ("--uavs", "4", "--range", "3km", "--reserve", "10"), 100, 88),
-    ],
-)
-def test_examples(tmp_path: Path, name: str, fleet: tuple[str, ...], n_tasks: int, least: int) -> None:
-    """With the solver that users get."""
-    pytest.importorskip("numba")
-    assert run(str(EXAMPLES / name), *fleet, "--time-limit", "1", "-o", str(tmp_path / "out")) == 0
-    plan = load_plan(tmp_path / "out" / "mission.json")
-    assert len(plan.tasks) == n_tasks and plan.n_served >= least and not plan.unserved
+def test_commands_of_the_examples_are_those_of_the_docs() -> None:
+    """Where they run, see `test_doc_blocks.py`."""
+    commands = re.findall(r"`(sb3-uav .*?)`", (EXAMPLES / "README.md").read_text(encoding="utf-8"))
+    page = (EXAMPLES.parents[1] / "docs" / "missions.md").read_text(encoding="utf-8").splitlines()
+    assert len(commands) == 4 and set(commands) <= set(page)
 
 
 def test_example_data_is_what_the_script_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
