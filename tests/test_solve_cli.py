@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 import sb3_uav.missions
 from sb3_uav.cli import main as cli
+from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.cli.mission_report import Progress, exit_code, print_plan, why_empty
 from sb3_uav.missions import Fleet, Plan, TaskList, Uav, load_plan, solve
 from sb3_uav.missions.fleet_options import FleetOptions
@@ -159,6 +161,24 @@ def test_ctrl_c_writes_nothing(tasks_csv: Path, monkeypatch: pytest.MonkeyPatch)
     assert not Path("out").exists()
 
 
+def test_ctrl_c_does_not_wait_for_the_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    ended: list[Any] = []
+    monkeypatch.setattr("os._exit", ended.append)
+    with ends_at_once("sb3-uav solve", lambda: ended.append("cleaned up")):
+        signal.raise_signal(signal.SIGINT)
+    assert ended == ["cleaned up", 130] and capsys.readouterr().err == "sb3-uav solve: interrupted\n"
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    # As under nohup.
+    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with ends_at_once("sb3-uav solve"):
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
 def test_a_depot_in_the_south(tasks_csv: Path) -> None:
     tasks_csv.write_text("id,lat,lon\na,-33.0,151.01\n", encoding="utf-8")
     assert run("tasks.csv", "--depot", "-33.0,151.0", *FLEET, *FAST, "-o", "out") == 0
@@ -264,12 +284,16 @@ def test_why_a_plan_may_be_empty_though_tasks_are_in_reach() -> None:
 def test_progress_on_a_terminal() -> None:
     console = rich_console.Console(file=io.StringIO(), force_terminal=True, width=80)
     with Progress(5.0, console) as progress:
+        progress._live.refresh()
+        assert "loading the solver" in console.file.getvalue()
+        progress.begin()
         progress(small_plan())
         progress._live.refresh()
     assert "of 5 s: 3 of 3 tasks, value 3" in console.file.getvalue()
     console = rich_console.Console(file=io.StringIO(), width=80)
     with Progress(5.0, console) as progress:
-        progress(small_plan())
+        solve(small_plan().tasks, Fleet.of_equal(1, 1e4), "greedy-insertion", on_plan=progress, on_start=progress.begin)
+        assert progress._start is not None
     assert console.file.getvalue() == ""
 
 
