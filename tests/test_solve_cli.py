@@ -108,7 +108,7 @@ FLEET = ("--uavs", "2", "--range", "6km")
         ((*FLEET, "--fleet", "fleet.csv"), "--fleet says it all"),
         ((*FLEET, "--reserve", "100"), "--reserve is 100; give a percentage"),
         ((*FLEET, "--reserve", "nan"), "--reserve is nan"),
-        ((*FLEET, "--depot", "47,8"), "a row is the depot already"),
+        ((*FLEET, "--depot", "47,8"), "is the depot already"),
         ((*FLEET, "--unit", "km"), "unit"),
         ((*FLEET, "--time-limit", "0"), "--time-limit is 0"),
         ((*FLEET, "--time-limit", "nan"), "--time-limit is nan"),
