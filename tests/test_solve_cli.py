@@ -20,6 +20,7 @@ from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.cli.mission_report import Progress, exit_code, print_plan, why_empty
 from sb3_uav.missions import Fleet, Plan, TaskList, Uav, load_plan, solve
 from sb3_uav.missions.fleet_options import FleetOptions
+from sb3_uav.solvers import NoScheduleError
 
 rich_console = pytest.importorskip("rich.console")
 pytest.importorskip("matplotlib")
@@ -159,6 +160,15 @@ def test_ctrl_c_writes_nothing(tasks_csv: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("sb3_uav.missions.search.solve", interrupted)
     assert run("tasks.csv", *FLEET, "-o", "out") == 130
     assert not Path("out").exists()
+
+
+def test_a_solver_without_a_plan(tasks_csv: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def give_up(*_: Any) -> None:
+        raise NoScheduleError("out of time")
+
+    monkeypatch.setattr("sb3_uav.missions.search.solve", give_up)
+    assert run("tasks.csv", *FLEET, "-o", "out") == 2
+    assert "The solver found no plan: out of time" in capsys.readouterr().err and not Path("out").exists()
 
 
 def test_ctrl_c_does_not_wait_for_the_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
