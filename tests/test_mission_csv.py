@@ -222,8 +222,8 @@ def test_too_many_rows(monkeypatch):
 def test_nothing_is_read_beyond_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_uav.missions.read.MAX_BYTES", 100)
     path = tmp_path / "large.csv"
-    path.write_text("id,lat,lon\n" + "#" * 1000)
-    with pytest.raises(ValueError, match="but at most 0 MiB are read; divide it"):
+    path.write_text("id,lat,lon\n" + "#" * 2**21)
+    with pytest.raises(ValueError, match=r"the file has 2\.0 MiB, but at most 0 MiB are read; divide it"):
         read_tasks(path)
 
 

@@ -194,6 +194,10 @@ def test_small_files_with_large_arrays_are_not_unpacked(monkeypatch):
     assert len(file.getvalue()) < 2**16
     with pytest.raises(ValueError, match="the file holds 1 arrays of 8 MiB; at most 100 arrays of 1 MiB are read"):
         read_tasks_from_bytes("t.npz", file.getvalue())
+    file = io.BytesIO()
+    np.savez(file, **{f"a{number}": np.zeros(1) for number in range(101)})
+    with pytest.raises(ValueError, match="the file holds 101 arrays of 0 MiB; at most 100 arrays"):
+        read_tasks_from_bytes("t.npz", file.getvalue())
 
 
 def test_long_instance_files_are_not_parsed(monkeypatch):
