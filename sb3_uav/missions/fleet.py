@@ -19,6 +19,7 @@ class Uav:
     :param start: Where it is, in the user's coordinates; at the depot when None
     :param end: Where it has to land, in the user's coordinates; at the depot when None
     :param reserve_percent: Part of the range that no plan may use
+    :param full_range_m: How far it flies with a full battery, in meters, if that is more than ``range_m``
     """
 
     id: str
@@ -27,6 +28,7 @@ class Uav:
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
     reserve_percent: float = 0.0
+    full_range_m: float | None = None
 
     @property
     def usable_m(self) -> float:
@@ -40,11 +42,13 @@ class Fleet:
     :param uavs: The UAVs, at least one
     :param source: Name of the file, for messages
     :param system: Coordinates of their starts and ends, if the file says which; those of the tasks when None
+    :param sha256: Digest of the file in hexadecimal digits; empty if there is none
     """
 
     uavs: tuple[Uav, ...]
     source: str = "fleet"
     system: System | None = None
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.uavs)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -109,7 +111,7 @@ def read_tasks_from_bytes(
         point = parse_point(depot) if isinstance(depot, str) else depot
         tasks = tasks.with_depot(np.array(point, float))
     check_tasks(tasks, allow_duplicates)
-    return tasks
+    return replace(tasks, sha256=hashlib.sha256(data).hexdigest())
 
 
 def read_fleet(path: str | os.PathLike[str]) -> Fleet:
@@ -135,7 +137,7 @@ def read_fleet_from_bytes(name: str, data: bytes) -> Fleet:
     _check_size(len(data), source)
     if data[:4] == b"PK\x03\x04" or data.removeprefix(_BOM).lstrip()[:1] in (b"{", b"["):
         raise ValueError(f"{source}: this is no CSV; give the fleet as a CSV with the columns id and range_m.")
-    return read_fleet_csv(data, source)
+    return replace(read_fleet_csv(data, source), sha256=hashlib.sha256(data).hexdigest())
 
 
 def _content(path: str | os.PathLike[str]) -> bytes:
