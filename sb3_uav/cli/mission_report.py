@@ -15,6 +15,8 @@ from sb3_uav.missions.plan import Plan, Reason
 from sb3_uav.missions.remarks import named
 
 _OK, _NOT_DONE = 0, 1
+# Characters of the bar that shows the time.
+_BAR = 20
 
 
 def exit_code(plan: Plan) -> int:
@@ -40,13 +42,8 @@ def print_plan(plan: Plan, files: Sequence[Path], console: Any = None) -> None:
 
     tasks = plan.tasks
     write(
-        f"{plan.n_served} of {len(tasks)} tasks served, value {plan.objective:g} of {tasks.values.sum():g}, "
-        f"{meters(plan.length_m)} flown"
-        + (
-            f", at most {plan.bound:g} possible (gap {plan.gap:.1%})"
-            if plan.bound is not None and plan.gap is not None
-            else ""
-        ),
+        f"{plan.n_served:,} of {count(len(tasks), 'task')} served, value {number(plan.objective)} of "
+        f"{number(float(tasks.values.sum()))}, {meters(plan.length_m)} flown{_proof(plan)}",
         "bold",
     )
     console.print(_table(rich, plan))
@@ -120,10 +117,11 @@ def _time(seconds: float) -> str:
 
 class Progress:
     """
-    One line on a terminal: elapsed time against the limit, and the best plan so far. Use it as a context manager, and as
-    ``on_plan`` of :func:`~sb3_uav.missions.search.solve`. Without a terminal it shows nothing.
+    One line on a terminal: elapsed time against the limit, and the best plan so far. Use it as a context manager, as
+    ``on_plan`` of :func:`~sb3_uav.missions.search.solve`, and :meth:`begin` as its ``on_start``. Without a terminal it shows
+    nothing.
 
-    :param time_limit: Seconds that the solver has
+    :param time_limit: Seconds that the solver has, above 0
     :param console: A rich console; the standard error when None
     :raises ImportError: If rich is not installed
     """
@@ -134,20 +132,27 @@ class Progress:
 
         self._rich = rich
         self._limit = time_limit
-        self._start = time.perf_counter()
+        self._start: float | None = None
         self._best = "no plan yet"
         self._lock = threading.Lock()
         console = rich.console.Console(file=sys.stderr) if console is None else console
         self._live = Live(console=console, get_renderable=self._line, refresh_per_second=5, transient=True)
         self._is_shown = console.is_terminal
 
-    def __enter__(self) -> Progress:
+    def begin(self) -> None:
+        """The solver is loaded, its time begins."""
         self._start = time.perf_counter()
+
+    def __enter__(self) -> Progress:
         if self._is_shown:
             self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """Clear the line and show the cursor again."""
         if self._is_shown:
             self._live.stop()
 
@@ -160,7 +165,10 @@ class Progress:
             self._best = best
 
     def _line(self) -> Any:
+        if self._start is None:
+            return self._rich.text.Text("loading the solver")
         elapsed = time.perf_counter() - self._start
-        full = int(20 * min(elapsed / self._limit, 1.0)) if self._limit > 0 else 20
+        full = int(_BAR * min(elapsed / self._limit, 1.0))
         with self._lock:
-            return self._rich.text.Text(f"{'━' * full}{' ' * (20 - full)} {elapsed:4.1f} of {self._limit:g} s: {self._best}")
+            text = f"{'━' * full}{' ' * (_BAR - full)} {elapsed:4.1f} of {self._limit:g} s: {self._best}"
+        return self._rich.text.Text(text, no_wrap=True, overflow="ellipsis")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.common.optional import require
 from sb3_uav.missions.flight import Firmware, FlightOptions, Landing, Vehicle
 
@@ -49,6 +51,7 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     of_tasks.add_argument("--unit", help="unit of x and y, such as m, km or ft, if the file does not say")
     of_tasks.add_argument("--allow-duplicates", action="store_true", help="several tasks may be at one place")
+    of_tasks.add_argument("--row", type=int, metavar="N", help="which instance of an .npz with several, from 0")
     add_fleet_options(parser)
     search = parser.add_argument_group("search")
     search.add_argument("--solver", metavar="SPEC", help="as for sb3-uav evaluate (default: the trained pair, repair, polish)")
@@ -114,7 +117,7 @@ def _joined(argv: Sequence[str]) -> list[str]:
     """argparse takes a southern latitude for an option: ``--depot -33,151`` becomes ``--depot=-33,151``."""
     joined: list[str] = []
     for word in argv:
-        if joined and joined[-1] == "--depot":
+        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z-]+", joined[-1]):
             joined[-1] += f"={word}"
         else:
             joined.append(word)
@@ -131,27 +134,28 @@ def main(argv: Sequence[str]) -> int:
     """
     args = _make_parser().parse_args(_joined(argv))
     from sb3_uav.cli.mission_report import Progress, exit_code, print_plan
-    from sb3_uav.evaluation.table import require_rich
     from sb3_uav.missions.fleet_options import FleetOptions
     from sb3_uav.missions.read import read_tasks
     from sb3_uav.missions.search import solve
-    from sb3_uav.missions.units import parse_point
     from sb3_uav.missions.write import check_folder, checked, write_mission
+    from sb3_uav.solvers.base import NoScheduleError
 
     # What may be missing or wrong is found before the long run, not after it.
-    require_rich()
+    require("rich", "The summary of a mission", "missions")
     require("matplotlib", "The map of a mission", "missions")
     require("plotly", "The map of a mission", "missions")
     if not 0 < args.time_limit < math.inf:
         raise ValueError(f"--time-limit is {args.time_limit:g}; give a number of seconds above 0.")
     flight = flight_of(args)
     check_folder(args.out, args.overwrite)
-    depot = None if args.depot is None else parse_point(args.depot)
-    tasks = read_tasks(args.tasks, unit=args.unit, depot=depot, allow_duplicates=args.allow_duplicates)
+    tasks = read_tasks(args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row)
     options = FleetOptions(args.fleet, args.uavs, args.range, args.endurance, args.speed, args.reserve)
     fleet = options.fleet(tasks)
-    with Progress(args.time_limit) as progress:
-        plan = solve(tasks, fleet, args.solver, args.time_limit, args.seed, progress)
+    with Progress(args.time_limit) as progress, ends_at_once("sb3-uav solve", progress.end):
+        try:
+            plan = solve(tasks, fleet, args.solver, args.time_limit, args.seed, progress, progress.begin)
+        except NoScheduleError as error:
+            raise ValueError(f"The solver found no plan: {error}") from error
     files = write_mission(plan, args.out, flight, args.overwrite)
     print_plan(checked(plan, flight), files)
     return exit_code(plan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_uav.envs.render import UAV_COLORS
 from sb3_uav.missions.coordinates import System
@@ -42,9 +42,36 @@ def uav_color(uav: int) -> str:
     return UAV_COLORS[uav % len(UAV_COLORS)]
 
 
-def uav_style(uav: int) -> int:
-    """:return: How many UAVs before this one have its color: what else than color has to tell them apart"""
-    return uav // len(UAV_COLORS)
+class Look(NamedTuple):
+    """
+    How a UAV is drawn. There are eight colors that people of any color vision tell apart; the ninth UAV has the first color
+    again, with hollow stops, the seventeenth with a dashed line, and so on.
+
+    :param dash: Of its line, as plotly names it
+    :param fill: Color of its stops
+    :param edge: Color around its stops
+    :param edge_width: Pixels
+    """
+
+    dash: str
+    fill: str
+    edge: str
+    edge_width: float
+
+    @property
+    def dash_array(self) -> str:
+        """The dash for SVG; empty for a solid line."""
+        return _DASHES[self.dash]
+
+
+_DASHES = {"solid": "", "dash": "7 4", "dot": "2 3", "dashdot": "8 3 2 3"}
+
+
+def uav_look(uav: int) -> Look:
+    """:return: How a UAV is drawn, by its number from 0"""
+    color, style = uav_color(uav), uav // len(UAV_COLORS)
+    dash = list(_DASHES)[style // 2 % len(_DASHES)]
+    return Look(dash, "#ffffff", color, 2.0) if style % 2 else Look(dash, color, "#ffffff", 1.0)
 
 
 def ink_on(color: str) -> str:
@@ -101,9 +128,14 @@ def why_skipped(skipped: Skipped) -> str:
     return f"{skipped.reason}: {missing} of range missing"
 
 
+def flies(route: Route) -> bool:
+    """:return: Whether a UAV leaves the ground"""
+    return bool(route.stops) or route.length_m > 0
+
+
 def route_facts(route: Route) -> str:
     """:return: Stops, length and share of the range of a route, in short"""
-    if not route.stops and route.length_m == 0:
+    if not flies(route):
         return "stays on the ground"
     return f"{count(len(route.stops), 'stop')}, {meters(route.length_m)}, {percent(route.share_of_range)} of range"
 

@@ -123,3 +123,9 @@ class Plan:
     def length_m(self) -> float:
         """Metres flown by all UAVs."""
         return math.fsum(route.length_m for route in self.routes)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from sb3_uav.missions.drawing import plan_html
+
+        return plan_html(self)

@@ -104,3 +104,9 @@ class TaskList:
     def with_depot(self, depot: Any) -> TaskList:
         """:return: The same tasks with another depot, ``(2,)``"""
         return replace(self, depot=np.asarray(depot, float).reshape(2))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from sb3_uav.missions.drawing import tasks_html
+
+        return tasks_html(self)

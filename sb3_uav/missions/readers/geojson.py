@@ -20,8 +20,8 @@ from sb3_uav.missions.writers.geojson_routes import PLANE_MEMBER
 _CRS84 = frozenset({"urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "OGC:CRS84"})
 _ALTITUDE_NAMES = ("alt", "altitude", "altitude_m")
 _HEIGHTS = (
-    "Altitudes are the third coordinates of the file, taken for meters above the depot; check whether they are heights above the "
-    "sea or the ellipsoid."
+    "Altitudes are the third coordinates of the file, taken for meters above the depot; check whether they are heights above "
+    "the sea or the ellipsoid."
 )
 
 

@@ -124,7 +124,7 @@ def tasks_of_items(
         elif item.command == _LANDING:
             in_landing = True
         else:
-            found.left_out[f"command {item.command}"] += 1
+            found.left_out[f"MAV_CMD {item.command}"] += 1
     if not found.items:
         raise ValueError(f"{source}: no item is a task; write a waypoint (16) for every task.")
     numbers = [item.number for item in found.items]

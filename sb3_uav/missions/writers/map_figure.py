@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import itertools
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -12,6 +13,7 @@ import numpy as np
 from sb3_uav.common.optional import require
 from sb3_uav.missions.labels import (
     count,
+    flies,
     headline,
     ink_on,
     number,
@@ -19,7 +21,7 @@ from sb3_uav.missions.labels import (
     route_facts,
     shown,
     uav_color,
-    uav_style,
+    uav_look,
     why_skipped,
 )
 from sb3_uav.missions.map_points import MapPoints, map_points
@@ -30,17 +32,20 @@ if TYPE_CHECKING:
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # Pixels: stops with and without a number in them, and how much of the distance between two stops one may fill.
-LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 14.0, 0.8
-ARROW = 9.0
+LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 12.0, 0.9
+# Tasks that are left out must not outshine the stops.
+LARGEST_SKIPPED = 9.0
+_ARROW, _ARROW_AT = 13.0, 0.56
 # What a figure is large that nobody has resized.
 _WIDTH = 700.0
 _LEGEND_CHARACTERS = 24
-_GRAY, _RED = "#6b6b6b", "#B3261E"
+_GRAY, _RED = "#7d838a", "#B3261E"
 _MUST_SYMBOL = "square"
-# Beyond the eight colors, UAVs differ in these too.
-_DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
-_SYMBOLS = ("circle", "hexagon", "pentagon", "octagon")
-_REASON_SYMBOLS: dict[Reason, str] = {"did not fit": "circle-open", "out of reach": "x-thin", "worth nothing": "circle-dot"}
+_REASON_SYMBOLS: dict[Reason, str] = {
+    "did not fit": "circle-open",
+    "out of reach": "x-thin",
+    "worth nothing": "circle-open-dot",
+}
 _SITES = {"start": "triangle-right", "end": "x", "start and end": "triangle-up"}
 
 
@@ -50,8 +55,8 @@ def plan_figure(plan: Plan) -> go.Figure:
 
     Every UAV has one entry in the legend, which shows and hides its tour and its stops. Stops are numbered in flying order,
     squares must be served, and tasks that are left out are gray, or red if they must be served. Hovering tells the rest in the
-    user's coordinates. Every trace says in its ``meta`` what it is: ``{"role": "tour" | "stops", "uav": NUMBER}``, or
-    ``{"role": "skipped" | "key" | "depot"}``.
+    user's coordinates. Every trace says in its ``meta`` what it is: ``{"role": "tour" | "stops" | "entry", "uav":
+    NUMBER}``, or ``{"role": "skipped" | "key" | "depot"}``.
 
     :param plan: A plan
     :return: A plotly figure
@@ -61,13 +66,14 @@ def plan_figure(plan: Plan) -> go.Figure:
     points = map_points(plan)
     size = stop_size(points.spacing * _WIDTH / points.extent)
     traces = [
-        *(_tour(plan, uav, points) for uav in range(len(plan.routes))),
-        *_skipped(plan, points),
+        *(_tour(plan, uav, points, size) for uav in range(len(plan.routes))),
+        *_skipped(plan, points, size),
         *(_stops(plan, uav, points, size) for uav in range(len(plan.routes))),
+        *(_entry(plan, uav, points) for uav in range(len(plan.routes))),
         *_keys(plan),
         _depot(plan),
     ]
-    return go.Figure([go.Scatter(trace) for trace in traces], _layout(plan))
+    return go.Figure([go.Scatter(trace) for trace in traces], _layout(plan, points))
 
 
 def stop_size(spacing: float) -> float:
@@ -84,75 +90,110 @@ def _text(name: str, limit: int = 60) -> str:
     return html.escape(shown(name, limit), quote=False)
 
 
-def _tour(plan: Plan, uav: int, points: MapPoints) -> dict[str, Any]:
-    """The line of a UAV, with a point in the middle of every leg for the arrow and for hovering."""
+def _tour(plan: Plan, uav: int, points: MapPoints, size: float) -> dict[str, Any]:
+    """The line of a UAV, with one more point on every leg for the arrow and for hovering."""
     route, corners = plan.routes[uav], points.routes[uav]
-    middles = (corners[:-1] + corners[1:]) / 2
+    # A bit beyond the middle, so that two arrows on the way out and back to the same stop do not meet.
+    middles = corners[:-1] + _ARROW_AT * (corners[1:] - corners[:-1])
     path = np.empty((len(corners) + len(middles), 2))
     path[::2], path[1::2] = corners, middles
     hover: list[str] = [""] * len(path)
     hover[::2] = [_site(plan, route, "starts"), *_stop_texts(plan, route), _site(plan, route, "ends")]
-    names = [_place(plan, uav, "start"), *(plan.tasks.ids[stop] for stop in route.stops), _place(plan, uav, "end")]
+    kinds = ["depot" if _at_depot(plan, route.points[row]) else kind for row, kind in ((0, "start"), (-1, "end"))]
+    names = [kinds[0], *(plan.tasks.ids[stop] for stop in route.stops), kinds[1]]
     hover[1::2] = [
         f"<b>{_text(route.uav.id)}</b>, leg {leg + 1} of {len(middles)}<br>{_text(names[leg])} → {_text(names[leg + 1])}<br>"
         f"{route.legs_m[leg]:,.1f} m"
         for leg in range(len(middles))
     ]
-    flies = bool(route.stops) or route.length_m > 0
-    # A trace without points would have no entry in the legend.
-    x, y = path.T if flies else np.full((2, 1), np.nan)
-    color = uav_color(uav)
     return {
-        "mode": "lines+markers",
-        "x": _rounded(x),
-        "y": _rounded(y),
-        "name": f"{_text(route.uav.id, _LEGEND_CHARACTERS)}: {route_facts(route)}",
-        "legendgroup": f"uav {uav}",
-        "line": {"color": color, "width": 2.5, "dash": _DASHES[uav_style(uav) % len(_DASHES)]},
+        "mode": "lines+markers" if size >= NUMBERED_STOP else "lines",
+        "x": _rounded(path[:, 0]) if flies(route) else [],
+        "y": _rounded(path[:, 1]) if flies(route) else [],
+        **_of_uav(plan, uav),
+        "showlegend": False,
+        "line": _line(uav),
         "marker": {
             "symbol": "arrow",
             "angleref": "previous",
-            "size": [ARROW * (number % 2) for number in range(len(x))],
-            "color": color,
+            "size": [_ARROW * (point % 2) for point in range(len(path))] if flies(route) else [],
+            "color": uav_color(uav),
+            "opacity": 1,
+            "line": {"width": 0},
         },
-        "text": hover if flies else [""],
+        "text": hover if flies(route) else [],
         "hoverinfo": "text",
         "meta": {"role": "tour", "uav": uav},
     }
 
 
-def _stops(plan: Plan, uav: int, points: MapPoints, size: float) -> dict[str, Any]:
-    """The stops of a UAV with their numbers, and where it starts and ends if that is not the depot."""
+def _of_uav(plan: Plan, uav: int) -> dict[str, Any]:
+    """What makes the traces of a UAV one."""
     route = plan.routes[uav]
-    sites = list(_own_sites(plan, uav))
-    rows = [0 if kind != "end" else -1 for kind, _ in sites]
-    places = np.vstack([points.routes[uav][1:-1][: len(route.stops)], points.routes[uav][rows]])
+    return {"name": f"{_text(route.uav.id, _LEGEND_CHARACTERS)}: {route_facts(route)}", "legendgroup": f"uav {uav}"}
+
+
+def _line(uav: int) -> dict[str, Any]:
+    return {"color": uav_color(uav), "width": 2.5, "dash": uav_look(uav).dash}
+
+
+def _stops(plan: Plan, uav: int, points: MapPoints, size: float) -> dict[str, Any]:
+    """The stops of a UAV with their numbers."""
+    route, look = plan.routes[uav], uav_look(uav)
+    x, y = points.routes[uav][1 : len(route.stops) + 1].T
     must = plan.tasks.must[list(route.stops)]
-    plain = _SYMBOLS[uav_style(uav) % len(_SYMBOLS)]
-    color = uav_color(uav)
-    mode = "markers+text" if size >= NUMBERED_STOP else "markers"
     return {
-        "mode": mode,
-        "x": _rounded(places[:, 0]),
-        "y": _rounded(places[:, 1]),
-        "name": _text(route.uav.id, _LEGEND_CHARACTERS),
-        "legendgroup": f"uav {uav}",
+        "mode": "markers+text" if size >= NUMBERED_STOP else "markers",
+        "x": _rounded(x),
+        "y": _rounded(y),
+        **_of_uav(plan, uav),
         "showlegend": False,
         "marker": {
-            "symbol": [*(_MUST_SYMBOL if first else plain for first in must), *(_SITES[kind] for kind, _ in sites)],
+            "symbol": [_MUST_SYMBOL if first else "circle" for first in must],
             "size": size,
-            "color": color,
+            "color": look.fill,
             "opacity": 1,
             "line": {
-                "color": [*("#000000" if first else "#ffffff" for first in must), *["#000000"] * len(sites)],
-                "width": [*(2 if first else 1 for first in must), *[1.5] * len(sites)],
+                "color": ["#000000" if first else look.edge for first in must],
+                "width": [2.2 if first else look.edge_width for first in must],
             },
         },
-        "text": [*(str(place) for place in range(1, len(route.stops) + 1)), *[""] * len(sites)],
-        "textfont": {"color": ink_on(color), "size": 10},
-        "hovertext": [*_stop_texts(plan, route), *(text for _, text in sites)],
+        "text": [str(place) for place in range(1, len(route.stops) + 1)],
+        "textfont": {"color": ink_on(look.fill), "size": 10},
+        "hovertext": list(_stop_texts(plan, route)),
+        "hoverlabel": {"bgcolor": uav_color(uav)},
         "hoverinfo": "text",
         "meta": {"role": "stops", "uav": uav},
+    }
+
+
+def _entry(plan: Plan, uav: int, points: MapPoints) -> dict[str, Any]:
+    """The entry of a UAV in the legend, and where it starts and ends if that is not the depot."""
+    sites, look = list(_own_sites(plan, uav)), uav_look(uav)
+    # The first point, which is nowhere, stands for the UAV in the legend; the others keep lines from connecting the sites.
+    nowhere = [math.nan, math.nan]
+    places = [nowhere]
+    for kind, _ in sites:
+        places += [points.routes[uav][-1 if kind == "end" else 0].tolist(), nowhere]
+    x, y = np.array(places).T
+    return {
+        "mode": "lines+markers",
+        "x": _rounded(x),
+        "y": _rounded(y),
+        **_of_uav(plan, uav),
+        "line": _line(uav),
+        "marker": {
+            "symbol": ["circle", *(symbol for kind, _ in sites for symbol in (_SITES[kind], "circle"))],
+            "size": 14,
+            "color": [look.fill, *[uav_color(uav)] * (len(places) - 1)],
+            "line": {
+                "color": [look.edge, *["#000000"] * (len(places) - 1)],
+                "width": [look.edge_width, *[1.5] * (len(places) - 1)],
+            },
+        },
+        "hovertext": ["", *(text for _, hover in sites for text in (hover, ""))],
+        "hoverinfo": "text",
+        "meta": {"role": "entry", "uav": uav},
     }
 
 
@@ -177,11 +218,6 @@ def _task_facts(plan: Plan, task: int) -> list[str]:
     return [position(tasks.system, tasks.points[task]), f"value {number(float(tasks.values[task]))}{service}"]
 
 
-def _place(plan: Plan, uav: int, which: str) -> str:
-    own = plan.fleet.uavs[uav]
-    return "depot" if (own.start if which == "start" else own.end) is None else which
-
-
 def _site(plan: Plan, route: Route, does: str) -> str:
     """What hovering over the start or the end of a route tells."""
     used = f"<br>{route.length_m:,.1f} m flown" if does == "ends" else ""
@@ -191,19 +227,24 @@ def _site(plan: Plan, route: Route, does: str) -> str:
     return f"<b>{_text(route.uav.id)}</b> {does} here<br>{position(plan.tasks.system, point)}{used}"
 
 
+def _at_depot(plan: Plan, point: np.ndarray) -> bool:
+    return plan.tasks.depot is not None and np.array_equal(point, plan.tasks.depot)
+
+
 def _own_sites(plan: Plan, uav: int) -> Iterator[tuple[str, str]]:
     """Where a UAV starts and ends, as far as that is not the depot: what it is, and what hovering tells."""
-    route, own = plan.routes[uav], plan.fleet.uavs[uav]
-    if own.start is not None and own.start == own.end:
+    route = plan.routes[uav]
+    start, end = (None if _at_depot(plan, point) else point for point in (route.points[0], route.points[-1]))
+    if start is not None and end is not None and np.array_equal(start, end):
         yield "start and end", _site(plan, route, "starts")
         return
-    if own.start is not None:
+    if start is not None:
         yield "start", _site(plan, route, "starts")
-    if own.end is not None and (route.stops or route.length_m > 0):
+    if end is not None and flies(route):
         yield "end", _site(plan, route, "ends")
 
 
-def _skipped(plan: Plan, points: MapPoints) -> Iterator[dict[str, Any]]:
+def _skipped(plan: Plan, points: MapPoints, size: float) -> Iterator[dict[str, Any]]:
     """The tasks that no UAV serves, a trace per reason."""
     for reason in get_args(Reason):
         skipped = [one for one in plan.skipped if one.reason == reason]
@@ -218,9 +259,10 @@ def _skipped(plan: Plan, points: MapPoints) -> Iterator[dict[str, Any]]:
             "x": _rounded(x),
             "y": _rounded(y),
             "name": f"{reason}: {count(len(skipped), 'task')}",
+            "legendrank": 1001,
             "marker": {
                 "symbol": [f"{_MUST_SYMBOL}-{'x-' if symbol == 'x-thin' else ''}open" if first else symbol for first in must],
-                "size": [12 if first else 9 for first in must],
+                "size": min(size, LARGEST_SKIPPED),
                 "color": [_RED if first else _GRAY for first in must],
                 "line": {"width": 1.7, "color": [_RED if first else _GRAY for first in must]},
             },
@@ -259,6 +301,7 @@ def _key(name: str, symbol: str) -> dict[str, Any]:
         "name": name,
         "marker": {"symbol": symbol, "size": 11, "color": "#bdbdbd", "line": {"color": "#000000", "width": 1.5}},
         "hoverinfo": "skip",
+        "legendrank": 1002,
         "meta": {"role": "key"},
     }
 
@@ -273,12 +316,13 @@ def _depot(plan: Plan) -> dict[str, Any]:
         "marker": {"symbol": "diamond", "size": 17, "color": "#000000", "line": {"color": "#ffffff", "width": 2}},
         "hovertext": [f"<b>depot</b><br>{position(plan.tasks.system, plan.tasks.depot)}"],
         "hoverinfo": "text",
+        "legendrank": 1003,
         "meta": {"role": "depot"},
     }
 
 
-def _layout(plan: Plan) -> dict[str, Any]:
-    directions = ("east", "north") if plan.tasks.system == "wgs84" else ("in x", "in y")
+def _layout(plan: Plan, points: MapPoints) -> dict[str, Any]:
+    directions = ("east of", "north of") if plan.tasks.system == "wgs84" else ("in x from", "in y from")
     axis = {
         "showgrid": True,
         "gridcolor": "#e6e8eb",
@@ -291,19 +335,30 @@ def _layout(plan: Plan) -> dict[str, Any]:
         "tickcolor": "#b8bcc2",
         "exponentformat": "none",
     }
+    ranges: list[dict[str, Any]] = [{}, {}]
+    if points.is_focused:
+        low, high = points.focus
+        margin = 0.06 * max(float((high - low).max()), 1.0)
+        ranges = [{"range": [float(low[row] - margin), float(high[row] + margin)]} for row in (0, 1)]
     return {
         "template": "none",
         "title": {"text": f"{_text(plan.tasks.source)}<br><sup>{headline(plan)}</sup>", "x": 0.02, "xanchor": "left"},
         "font": {"family": FONT, "size": 13, "color": "#1d2125"},
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#fafbfc",
-        "xaxis": {**axis, "title": {"text": f"meters {directions[0]} of the depot"}},
-        "yaxis": {**axis, "title": {"text": f"meters {directions[1]} of the depot"}, "scaleanchor": "x", "scaleratio": 1},
-        "legend": {"groupclick": "togglegroup", "itemsizing": "constant", "font": {"size": 12}, "tracegroupgap": 0},
+        "xaxis": {**axis, **ranges[0], "title": {"text": f"meters {directions[0]} the depot", "standoff": 8}},
+        "yaxis": {
+            **axis,
+            **ranges[1],
+            "title": {"text": f"meters {directions[1]} the depot", "standoff": 8},
+            "scaleanchor": "x",
+            "scaleratio": 1,
+        },
+        "legend": {"groupclick": "togglegroup", "itemwidth": 40, "font": {"size": 12}, "tracegroupgap": 0},
         "hovermode": "closest",
         "hoverlabel": {"align": "left", "font": {"family": FONT, "size": 13}},
         "dragmode": "pan",
-        "margin": {"l": 70, "r": 20, "t": 70, "b": 55},
+        "margin": {"l": 85, "r": 20, "t": 70, "b": 64},
     }
 
 

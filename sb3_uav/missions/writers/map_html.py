@@ -12,23 +12,23 @@ from typing import Any
 
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.optional import require
+from sb3_uav.missions.drawing import uav_sample
 from sb3_uav.missions.labels import (
     count,
     duration,
     escaped,
+    flies,
     headline,
     meters,
     number,
     percent,
-    uav_color,
-    uav_style,
     why_skipped,
 )
 from sb3_uav.missions.map_points import map_points
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.remarks import REVIEW
 from sb3_uav.missions.writers.map_figure import (
-    ARROW,
+    LARGEST_SKIPPED,
     LARGEST_STOP,
     NUMBERED_STOP,
     SMALLEST_STOP,
@@ -39,16 +39,14 @@ from sb3_uav.missions.writers.map_figure import (
 # Sentences are not cut where names are.
 _SENTENCE = 2_000
 _MAX_REMARKS = 200
-# Backgrounds of the samples of color: gaps for UAVs that share a color.
-_GAPS = ("", "6px,3px", "3px,2px", "9px,2px", "12px,3px", "2px,3px")
 
 
 def write_map_html(plan: Plan, path: str | os.PathLike[str]) -> None:
     """
     Write a plan as a page with an interactive map and a table of the routes.
 
-    The page holds plotly.js. It makes no request, and its Content-Security-Policy would stop any, as well as scripts that names
-    from a hostile file smuggle in: see https://developer.mozilla.org/en-US/docs/Web/HTTP/Reference/Headers/Content-Security-Policy.
+    The page holds plotly.js. It makes no request. Its Content-Security-Policy would stop any, and every script that a hostile
+    file smuggles in by a name: see https://www.w3.org/TR/CSP3/.
 
     :param plan: A plan
     :param path: The ``.html`` to write
@@ -85,8 +83,9 @@ def map_page(plan: Plan) -> str:
             _remarks(plan),
             '<div class="frame"><div id="map"></div><div id="scale" class="scale"></div></div>',
             "<noscript><p>The map needs JavaScript; the tables do not.</p></noscript>",
+            _outside(plan),
             '<p class="hint">Click a tour or a stop to light up its UAV, and again to reset. Click the legend to hide a UAV. '
-            "Scroll to zoom, drag to move, double-click to see everything.</p>",
+            "Scroll to zoom: stops that lie close together get their numbers then. Drag to move, double-click to see all.</p>",
             _routes_table(plan),
             _skipped_table(plan),
             f'<p class="made">{_made_by(plan)}</p>',
@@ -134,7 +133,8 @@ def _page_data(plan: Plan) -> str:
     data = {
         "figure": figure,
         "spacing": map_points(plan).spacing,
-        "sizes": [SMALLEST_STOP, LARGEST_STOP, NUMBERED_STOP, STOP_SHARE, ARROW],
+        "sizes": [SMALLEST_STOP, LARGEST_STOP, NUMBERED_STOP, STOP_SHARE],
+        "largestSkipped": LARGEST_SKIPPED,
     }
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -149,15 +149,33 @@ def _remarks(plan: Plan) -> str:
     return f'<div class="remarks" role="note">{"".join(lines)}</div>'
 
 
+def _outside(plan: Plan) -> str:
+    n_outside = map_points(plan).n_outside
+    if not n_outside:
+        return ""
+    verb = "lies" if n_outside == 1 else "lie"
+    return f'<p class="outside">{count(n_outside, "task")} {verb} far away, outside of this view. Double-click to see all.</p>'
+
+
 def _routes_table(plan: Plan) -> str:
     has_service = any(route.service_m > 0 for route in plan.routes)
     has_time = any(route.seconds is not None for route in plan.routes)
-    head = ["UAV", "Stops", "Value", "Length", *["Service"] * has_service, "Range", "Used", *["Time in the air"] * has_time]
+    words = ' class="words"'
+    head = [
+        "UAV",
+        "Stops",
+        "Value",
+        "Length",
+        *["Service"] * has_service,
+        "Range",
+        "Used of it",
+        *["Time in the air"] * has_time,
+    ]
     rows = []
     for uav, route in enumerate(plan.routes):
         value = float(plan.tasks.values[list(route.stops)].sum())
         cells = [
-            f'{_swatch(uav)}<button class="name" type="button" data-uav="{uav}" aria-pressed="false">'
+            f'{uav_sample(uav)}<button class="name" type="button" data-uav="{uav}" aria-pressed="false">'
             f"{escaped(route.uav.id)}</button>",
             f"{len(route.stops):,}",
             number(value),
@@ -165,26 +183,17 @@ def _routes_table(plan: Plan) -> str:
             *[meters(route.service_m)] * has_service,
             meters(route.uav.range_m),
             _share(route),
-            *["" if route.seconds is None else duration(route.seconds)] * has_time,
+            *[duration(route.seconds) if route.seconds and flies(route) else ""] * has_time,
         ]
         rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    lines = "\n".join(rows)
+    titles, lines = "".join(f"<th{words * (name == 'Used of it')}>{name}</th>" for name in head), "\n".join(rows)
     foot = ["All", f"{plan.n_served:,}", number(plan.objective), meters(plan.length_m)]
     foot += [""] * (len(head) - len(foot))
     return (
         '<h2>Routes</h2>\n<div class="wide"><table id="routes"><thead><tr>'
-        f"{''.join(f'<th>{name}</th>' for name in head)}</tr></thead>\n<tbody>{lines}</tbody>\n"
+        f"{titles}</tr></thead>\n<tbody>{lines}</tbody>\n"
         f"<tfoot><tr>{''.join(f'<td>{cell}</td>' for cell in foot)}</tr></tfoot></table></div>"
     )
-
-
-def _swatch(uav: int) -> str:
-    color, gap = uav_color(uav), _GAPS[uav_style(uav) % len(_GAPS)]
-    background = color
-    if gap:
-        on, off = (int(length.removesuffix("px")) for length in gap.split(","))
-        background = f"repeating-linear-gradient(90deg,{color} 0 {on}px,transparent {on}px {on + off}px)"
-    return f'<span class="swatch" style="background:{background}"></span>'
 
 
 def _share(route: Route) -> str:
