@@ -1,0 +1,223 @@
+"""What worker processes do: read a file, solve a problem, write the files of a mission."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+import time
+import zipfile
+import zlib
+from dataclasses import replace
+from functools import cache
+from importlib import import_module, util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_uav.missions.fleet import Fleet, Uav
+from sb3_uav.missions.flight import FlightOptions
+from sb3_uav.missions.tasks import TaskList
+from sb3_uav.web.workers import Message, Send
+
+# Better plans follow each other within milliseconds at the beginning; a person sees a few a second.
+_PAUSE = 0.2
+
+
+@cache
+def warm() -> None:
+    """Import the solvers, compile the local search and load the networks, by solving two tiny missions."""
+    import torch as th
+
+    # One worker is one core. Also, a process that has used more threads cannot be forked safely.
+    th.set_num_threads(1)
+    from sb3_uav.missions.search import solve
+
+    points = np.random.default_rng(0).uniform(0.0, 1000.0, (12, 2))
+    for values in (np.ones(12), np.arange(1.0, 13.0)):
+        tasks = TaskList.of(range(12), points, "plane", values, depot=(500.0, 500.0))
+        solve(tasks, Fleet.of_equal(2, 1500.0), time_limit=0.05)
+
+
+def do(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
+    """
+    :param request: ``{"kind": "read" | "solve" | "write", ...}``
+    :param blocks: What goes with it
+    :param send: Called with early results
+    :return: The last result
+    :raises ValueError: If the input is wrong
+    """
+    return {"read": _read, "solve": _solve, "write": _write}[request["kind"]](request, blocks, send)
+
+
+def _read(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
+    """A file of tasks, or of a fleet, into plain data."""
+    name, most = request["name"], request["max_tasks"]
+    kind = "fleet" if request["what"] == "fleet" else "tasks"
+    if kind == "fleet":
+        fleet = _read_fleet(name, blocks[0])
+        if len(fleet) > request["max_uavs"]:
+            raise ValueError(f"{name}: there are {len(fleet)} UAVs; this server admits {request['max_uavs']}.")
+        return {"event": "done"}, [_packed({"uavs": [_uav_to_json(uav) for uav in fleet]})]
+    tasks = _read_tasks(name, blocks[0], request)
+    if len(tasks) > most:
+        raise ValueError(f"{name}: there are {len(tasks)} tasks; this server admits {most}. Split the file, or ask for more.")
+    return {"event": "done"}, [_packed(_tasks_to_json(tasks))]
+
+
+def _read_tasks(name: str, data: bytes, request: dict[str, Any]) -> TaskList:
+    if name.lower().endswith(".json"):
+        found = _tasks_of_json(name, data)
+        if found is not None:
+            return found
+    if util.find_spec("sb3_uav.missions.read") is None:
+        raise ValueError(f"{name}: this installation reads no files yet.")
+    read: Any = import_module("sb3_uav.missions.read")
+    options = {key: request[key] for key in ("unit", "depot", "allow_duplicates") if request.get(key) is not None}
+    tasks: TaskList = read.read_tasks_from_bytes(name, data, **options)
+    return tasks
+
+
+def _tasks_of_json(name: str, data: bytes) -> TaskList | None:
+    """A mission that this program has written; None if it is something else."""
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{name}: this is not JSON ({str(error)[:200]}).") from error
+    if not isinstance(document, dict) or document.get("format") != "sb3-uav mission":
+        return None
+    from sb3_uav.missions.plan_file import plan_from_json
+
+    plan = plan_from_json(document, name)
+    return replace(plan.tasks, fleet=plan.fleet)
+
+
+def _read_fleet(name: str, data: bytes) -> Fleet:
+    if util.find_spec("sb3_uav.missions.read") is None:
+        raise ValueError(f"{name}: this installation reads no files of fleets yet.")
+    read: Any = import_module("sb3_uav.missions.read")
+    if hasattr(read, "read_fleet_from_bytes"):
+        found: Fleet = read.read_fleet_from_bytes(name, data)
+        return found
+    with tempfile.TemporaryDirectory() as folder:
+        # Under a name of ours: the name of the upload never becomes a path.
+        path = Path(folder) / "fleet.csv"
+        path.write_bytes(data)
+        try:
+            return replace(read.read_fleet(path), source=name)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), name)) from None
+
+
+def _tasks_to_json(tasks: TaskList) -> dict[str, Any]:
+    return {
+        "system": tasks.system,
+        "meters_per_unit": tasks.meters_per_unit,
+        "depot": None if tasks.depot is None else tasks.depot.tolist(),
+        "source": tasks.source,
+        "tasks": [
+            {
+                "id": tasks.ids[task],
+                "point": tasks.points[task].tolist(),
+                "value": float(tasks.values[task]),
+                "service_s": float(tasks.service_s[task]),
+                "must": bool(tasks.must[task]),
+                "altitude_m": None if np.isnan(tasks.altitudes[task]) else float(tasks.altitudes[task]),
+            }
+            for task in range(len(tasks))
+        ],
+        "uavs": None if tasks.fleet is None else [_uav_to_json(uav) for uav in tasks.fleet],
+    }
+
+
+def _uav_to_json(uav: Uav) -> dict[str, Any]:
+    return {
+        "id": uav.id,
+        "range_m": uav.range_m,
+        "speed_mps": uav.speed_mps,
+        "start": None if uav.start is None else list(uav.start),
+        "end": None if uav.end is None else list(uav.end),
+        "reserve_percent": uav.reserve_percent,
+    }
+
+
+def problem_of(problem: dict[str, Any]) -> tuple[TaskList, Fleet]:
+    """
+    :param problem: As of :class:`~sb3_uav.web.schemas.Problem`
+    :return: Tasks and fleet; tasks that are forbidden are left out
+    """
+    given = [task for task in problem["tasks"]["tasks"] if not task["forbidden"]]
+    places = [f"task {number}" for number, task in enumerate(problem["tasks"]["tasks"], 1) if not task["forbidden"]]
+    tasks = TaskList.of(
+        [task["id"] for task in given],
+        [task["point"] for task in given],
+        problem["tasks"]["system"],
+        [task["value"] for task in given],
+        [task["service_s"] for task in given],
+        [task["must"] for task in given],
+        depot=problem["tasks"]["depot"],
+        altitudes=np.array([np.nan if task["altitude_m"] is None else task["altitude_m"] for task in given], float),
+        meters_per_unit=problem["tasks"]["meters_per_unit"],
+        places=tuple(places),
+        source=problem["tasks"]["source"],
+    )
+    uavs = (
+        Uav(
+            uav["id"],
+            uav["range_m"],
+            uav["speed_mps"],
+            None if uav["start"] is None else (uav["start"][0], uav["start"][1]),
+            None if uav["end"] is None else (uav["end"][0], uav["end"][1]),
+            uav["reserve_percent"],
+        )
+        for uav in problem["uavs"]
+    )
+    return tasks, Fleet(tuple(uavs))
+
+
+def _solve(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
+    from sb3_uav.missions.search import solve
+    from sb3_uav.web.plan_view import plan_parts
+
+    problem = json.loads(blocks[0])
+    tasks, fleet = problem_of(problem)
+    if util.find_spec("sb3_uav.missions.readers.checks") is not None:
+        checks: Any = import_module("sb3_uav.missions.readers.checks")
+        checks.check_tasks(tasks, problem["allow_duplicates"])
+    forbidden = [task["id"] for task in problem["tasks"]["tasks"] if task["forbidden"]]
+    last = [-_PAUSE]
+
+    def on_plan(plan: Any) -> None:
+        if time.monotonic() - last[0] >= _PAUSE:
+            send({"event": "plan", "objective": plan.objective}, plan_parts(plan, forbidden))
+            last[0] = time.monotonic()
+
+    plan = solve(tasks, fleet, problem["solver"], problem["time_limit"], problem["seed"], on_plan)
+    return {"event": "done", "objective": plan.objective}, plan_parts(plan, forbidden)
+
+
+def _write(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
+    from sb3_uav.missions.plan_file import PLAN_FILE, plan_from_json
+
+    mission = json.loads(zlib.decompress(blocks[0]))
+    plan = replace(plan_from_json(mission, PLAN_FILE), bound=mission.get("bound"))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "mission"
+        if util.find_spec("sb3_uav.missions.write") is None:
+            from sb3_uav.missions.plan_file import save_plan
+
+            save_plan(plan, out / PLAN_FILE)
+        else:
+            write: Any = import_module("sb3_uav.missions.write")
+            write.write_mission(plan, out, FlightOptions(**request["flight"]))
+        data = io.BytesIO()
+        with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in sorted(out.rglob("*")):
+                if path.is_file():
+                    archive.write(path, path.relative_to(folder).as_posix())
+    return {"event": "done"}, [data.getvalue()]
+
+
+def _packed(data: Any) -> bytes:
+    return json.dumps(data, allow_nan=False).encode()
