@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from sb3_uav.missions.coordinates import System
+
 
 @dataclass(frozen=True)
 class Uav:
@@ -37,10 +39,14 @@ class Fleet:
     """
     :param uavs: The UAVs, at least one
     :param source: Name of the file, for messages
+    :param system: Coordinates of their starts and ends, if the file says which; those of the tasks when None
+    :param sha256: Digest of the file in hexadecimal digits; empty if there is none
     """
 
     uavs: tuple[Uav, ...]
     source: str = "fleet"
+    system: System | None = None
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.uavs)
@@ -62,3 +68,9 @@ class Fleet:
         """
         uavs = (Uav(f"uav-{n}", range_m, speed_mps, reserve_percent=reserve_percent) for n in range(1, n_uavs + 1))
         return cls(tuple(uavs), source)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from sb3_uav.missions.drawing import fleet_html
+
+        return fleet_html(self)

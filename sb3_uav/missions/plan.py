@@ -25,6 +25,7 @@ class Route:
     :param legs_m: ``(n_stops + 1,)``, length of every leg in meters, geodesic for latitudes and longitudes; 0 where the UAV
         stays on the ground
     :param service_m: What serving the stops costs, in meters of its range
+    :param service_s: How long serving the stops takes, in seconds
     """
 
     uav: Uav
@@ -32,6 +33,7 @@ class Route:
     points: np.ndarray
     legs_m: np.ndarray
     service_m: float
+    service_s: float = 0.0
 
     @property
     def length_m(self) -> float:
@@ -51,7 +53,7 @@ class Route:
     @property
     def seconds(self) -> float | None:
         """Time in the air, without takeoff and landing; None if nobody said how fast it flies."""
-        return None if self.uav.speed_mps is None else self.used_m / self.uav.speed_mps
+        return None if self.uav.speed_mps is None else self.length_m / self.uav.speed_mps + self.service_s
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Plan:
     :param seconds: Wall time of the solver
     :param bound: A proven upper bound of the objective; None if there is none
     :param remarks: What a person should know before flying it, a sentence each
+    :param time_limit: Seconds that the solver was given; None if nobody said
     """
 
     tasks: TaskList
@@ -99,6 +102,7 @@ class Plan:
     seconds: float
     bound: float | None = None
     remarks: tuple[str, ...] = ()
+    time_limit: float | None = None
 
     @property
     def gap(self) -> float | None:
@@ -113,3 +117,9 @@ class Plan:
     def length_m(self) -> float:
         """Metres flown by all UAVs."""
         return math.fsum(route.length_m for route in self.routes)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from sb3_uav.missions.drawing import plan_html
+
+        return plan_html(self)

@@ -68,7 +68,8 @@ def solve(
     start = time.perf_counter()
 
     def plan_of(schedule: Schedule) -> Plan:
-        return make_plan(tasks, fleet, schedule, chosen.name, seed, time.perf_counter() - start, instance=instance)
+        plan = make_plan(tasks, fleet, schedule, chosen.name, seed, time.perf_counter() - start, instance=instance)
+        return replace(plan, time_limit=time_limit)
 
     if on_plan is not None:
         best: list[tuple[int, float, float]] = []
@@ -144,6 +145,6 @@ def measured_routes(tasks: TaskList, fleet: Fleet, routes: Sequence[Sequence[int
         legs = coordinates.leg_lengths(points)
         if not stops and legs.sum() > uav.usable_m:
             legs = np.zeros(1)
-        service = math.fsum(tasks.service_s[list(stops)]) * speed
-        measured.append(Route(uav, tuple(stops), points, legs, service))
+        seconds = math.fsum(tasks.service_s[list(stops)])
+        measured.append(Route(uav, tuple(stops), points, legs, seconds * speed, seconds))
     return tuple(measured)
