@@ -42,8 +42,9 @@ class Refusal(Strict):
 
 
 class FileTasks(TasksIn):
-    """The tasks of a file, and its fleet if it has one."""
+    """The tasks of a file, its fleet if it has one, and what else the file says."""
 
+    notes: list[str] = Field(default=[])
     uavs: list[dict[str, Any]] | None = None
 
 
@@ -60,6 +61,11 @@ class Rooms:
         self.solves = Pool(limits.max_solves, limits.max_waiting, limits.max_kept, "solves")
         # Files are read and written apart from solves, so that neither waits for the other.
         self.desk = Pool(1, 32, 1, "files")
+
+    def open(self) -> None:
+        """Start the processes."""
+        self.solves.open()
+        self.desk.open()
 
     def close(self) -> None:
         """End all processes."""
@@ -227,7 +233,7 @@ def api_router(rooms: Rooms) -> APIRouter:
     ) -> Progress:
         """Read a file of tasks and start a solve for a fleet of equal UAVs."""
         read = FileTasks.model_validate_json(await rooms.read_tasks(name, await request.body(), unit, allow_duplicates))
-        tasks = TasksIn(**read.model_dump(exclude={"uavs"}))
+        tasks = TasksIn(**read.model_dump(exclude={"uavs", "notes"}))
         if depot is not None:
             tasks = TasksIn(**{**tasks.model_dump(), "depot": _numbers(depot)})
         fleet = FleetIn(count=count, range_m=range_m, speed_mps=speed_mps, reserve_percent=reserve_percent)

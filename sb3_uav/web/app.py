@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
+import anyio
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse
@@ -21,7 +22,7 @@ import sb3_uav
 from sb3_uav.web.api import Refusal, Rooms, api_router
 from sb3_uav.web.guard import Guard, Keys, cookie_of
 from sb3_uav.web.limits import Limits
-from sb3_uav.web.schemas import Draft, Strict
+from sb3_uav.web.schemas import Draft, Strict, sentence_of
 from sb3_uav.web.sessions import Sessions
 
 STATIC = Path(__file__).parent / "static"
@@ -71,8 +72,11 @@ def create_app(settings: Settings | None = None) -> Any:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        yield
-        rooms.close()
+        rooms.open()
+        try:
+            yield
+        finally:
+            await anyio.to_thread.run_sync(rooms.close)
 
     # Not FastAPI's pages of documentation: they load scripts from elsewhere.
     app = FastAPI(
@@ -165,27 +169,12 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     @app.exception_handler(ValidationError)
     async def wrong(_: Request, error: RequestValidationError | ValidationError) -> JSONResponse:
-        return JSONResponse({"detail": sentence_of(error)}, 422)
+        return JSONResponse({"detail": sentence_of(error.errors())}, 422)
 
     @app.exception_handler(Exception)
     async def broken(_: Request, error: Exception) -> JSONResponse:
         logging.getLogger("uvicorn.error").error("%s", type(error).__name__, exc_info=error)
         return JSONResponse({"detail": "This is a fault of the program, not of your input."}, 500)
-
-
-def sentence_of(error: RequestValidationError | ValidationError) -> str:
-    """
-    :param error: What pydantic says
-    :return: Where the first mistake is, and what is wrong there
-    """
-    found = error.errors()
-    if not found:
-        return "The request is wrong."
-    first = found[0]
-    place = ".".join(str(part)[:60] for part in first["loc"] if part not in ("body", "query", "path"))
-    text = str(first["msg"]).removeprefix("Value error, ").rstrip(".")
-    more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
-    return f"{place}: {text}{more}." if place else f"{text}{more}."
 
 
 def _name_errors(app: FastAPI) -> None:

@@ -87,6 +87,9 @@ class Pool:
         self._ready = [False] * size
         self.start_error: str | None = None
         self._threads = [threading.Thread(target=self._serve, args=(slot,), daemon=True) for slot in range(size)]
+
+    def open(self) -> None:
+        """Start the workers. Jobs that are given before wait."""
         for thread in self._threads:
             thread.start()
 
@@ -149,7 +152,8 @@ class Pool:
             self._queue.clear()
             self._changed.notify_all()
         for thread in self._threads:
-            thread.join(10.0)
+            if thread.is_alive():
+                thread.join(10.0)
 
     def _drop_oldest(self) -> None:
         ended = [name for name, job in self._jobs.items() if job.over.is_set()]

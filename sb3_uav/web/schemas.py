@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import unicodedata
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
 
 from sb3_uav.missions.flight import Firmware, Landing, Vehicle
 from sb3_uav.web.limits import MOST_TASKS, MOST_UAVS
 
-#: Ids of tasks.
-TaskId = Annotated[str, StringConstraints(min_length=1, max_length=100)]
-#: Ids of UAVs. They become parts of file names in downloads.
-UavId = Annotated[str, StringConstraints(min_length=1, max_length=50, pattern=r"^[^\W_][\w .+-]*$")]
+# As in sb3_uav.missions.readers.checks, so that what can be read can be sent.
+_UNSAFE = frozenset(("Cc", "Cs", "Zl", "Zp"))
+_BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+
+
+def _safe(text: str) -> str:
+    check_text(text, "this")
+    return text
+
+
+#: Ids of tasks and UAVs.
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_safe)]
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 Point = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
-Meters = Annotated[float, Field(gt=0, le=1e8)]
-Speed = Annotated[float, Field(gt=0, le=1000)]
+Meters = Annotated[float, Field(ge=0, le=1e9)]
+Speed = Annotated[float, Field(gt=0, le=1e4)]
 Percent = Annotated[float, Field(ge=0, lt=100)]
 
 
@@ -27,27 +37,22 @@ class Strict(BaseModel):
 class TaskIn(Strict):
     """A task."""
 
-    id: TaskId
+    id: Name
     point: Point = Field(description="[latitude, longitude] in degrees, or [x, y] in units of the plane")
-    value: float = Field(default=1.0, ge=0, le=1e9)
-    service_s: float = Field(default=0.0, ge=0, le=1e6, description="Seconds that a UAV stays there")
+    value: float = Field(default=1.0, ge=0, le=1e12)
+    service_s: float = Field(default=0.0, ge=0, le=1e9, description="Seconds that a UAV stays there")
     must: bool = Field(default=False, description="Comes before all tasks that need not be served")
-    altitude_m: float | None = Field(default=None, ge=0, le=10_000, description="Meters above the depot")
+    altitude_m: float | None = Field(default=None, ge=-1_000, le=10_000, description="Meters above the depot")
     forbidden: bool = Field(default=False, description="Not to be served, whatever it is worth")
-
-    @model_validator(mode="after")
-    def _check(self) -> TaskIn:
-        check_text(self.id, "id")
-        return self
 
 
 class TasksIn(Strict):
     """A list of tasks in the coordinates of the user."""
 
     system: Literal["wgs84", "plane"]
-    meters_per_unit: float = Field(default=1.0, ge=1e-6, le=1e6)
+    meters_per_unit: float = Field(default=1.0, gt=0, le=1e9)
     depot: Point | None = None
-    source: str = Field(default="tasks", max_length=200)
+    source: str = Field(default="tasks", max_length=300)
     tasks: list[TaskIn] = Field(max_length=MOST_TASKS)
 
     @model_validator(mode="after")
@@ -73,7 +78,7 @@ class TasksIn(Strict):
 class UavIn(Strict):
     """A UAV."""
 
-    id: UavId
+    id: Name
     range_m: Meters
     speed_mps: Speed | None = None
     start: Point | None = Field(default=None, description="Where it is; at the depot when null")
@@ -85,7 +90,7 @@ class FleetIn(Strict):
     """Either ``uavs``, or ``count`` equal ones."""
 
     count: int | None = Field(default=None, ge=1, le=MOST_UAVS)
-    range_m: Meters | None = None
+    range_m: Annotated[float, Field(gt=0, le=1e9)] | None = None
     speed_mps: Speed | None = None
     reserve_percent: Percent = 0.0
     uavs: list[UavIn] | None = Field(default=None, min_length=1, max_length=MOST_UAVS)
@@ -179,10 +184,28 @@ def check_text(text: str, what: str) -> None:
     """
     :param text: Text of the user
     :param what: What it is
-    :raises ValueError: If it has control characters or halves of surrogate pairs
+    :raises ValueError: If it has characters that are written into no file
     """
-    if any(
-        ord(char) < 32 or 0x7F <= ord(char) <= 0x9F or 0xD800 <= ord(char) <= 0xDFFF or ord(char) in (0x2028, 0x2029)
-        for char in text
-    ):
+    if any(unicodedata.category(char) in _UNSAFE or char in _BIDI for char in text):
         raise ValueError(f"{what} has control characters; leave them out")
+
+
+def one_sentence(error: ValidationError) -> str:
+    """
+    :param error: What pydantic says
+    :return: Where the first mistake is, and what is wrong there
+    """
+    return sentence_of(error.errors(include_url=False, include_context=False, include_input=False))
+
+
+def sentence_of(found: Sequence[Any]) -> str:
+    """
+    :param found: Mistakes as pydantic lists them
+    :return: Where the first one is, and what is wrong there
+    """
+    if not found:
+        return "The request is wrong."
+    place = ".".join(str(part)[:60] for part in found[0]["loc"] if part not in ("body", "query", "path"))
+    text = str(found[0]["msg"]).removeprefix("Value error, ").rstrip(".")
+    more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+    return f"{place}: {text}{more}." if place else f"{text}{more}."

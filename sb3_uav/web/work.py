@@ -10,11 +10,11 @@ import zipfile
 import zlib
 from dataclasses import replace
 from functools import cache
-from importlib import import_module, util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.flight import FlightOptions
@@ -56,10 +56,12 @@ def _read(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
     name, most = request["name"], request["max_tasks"]
     kind = "fleet" if request["what"] == "fleet" else "tasks"
     if kind == "fleet":
-        fleet = _read_fleet(name, blocks[0])
+        from sb3_uav.missions.read import read_fleet_from_bytes
+
+        fleet = read_fleet_from_bytes(name, blocks[0])
         if len(fleet) > request["max_uavs"]:
             raise ValueError(f"{name}: there are {len(fleet)} UAVs; this server admits {request['max_uavs']}.")
-        return {"event": "done"}, [_packed({"uavs": [_uav_to_json(uav) for uav in fleet]})]
+        return {"event": "done"}, [_packed({"system": fleet.system, "uavs": [_uav_to_json(uav) for uav in fleet]})]
     tasks = _read_tasks(name, blocks[0], request)
     if len(tasks) > most:
         raise ValueError(f"{name}: there are {len(tasks)} tasks; this server admits {most}. Split the file, or ask for more.")
@@ -67,47 +69,35 @@ def _read(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
 
 
 def _read_tasks(name: str, data: bytes, request: dict[str, Any]) -> TaskList:
+    from sb3_uav.missions.read import read_tasks_from_bytes
+
     if name.lower().endswith(".json"):
-        found = _tasks_of_json(name, data)
+        found = _tasks_of_mission(name, data)
         if found is not None:
             return found
-    if util.find_spec("sb3_uav.missions.read") is None:
-        raise ValueError(f"{name}: this installation reads no files yet.")
-    read: Any = import_module("sb3_uav.missions.read")
-    options = {key: request[key] for key in ("unit", "depot", "allow_duplicates") if request.get(key) is not None}
-    tasks: TaskList = read.read_tasks_from_bytes(name, data, **options)
-    return tasks
+    return read_tasks_from_bytes(name, data, unit=request["unit"], allow_duplicates=request["allow_duplicates"])
 
 
-def _tasks_of_json(name: str, data: bytes) -> TaskList | None:
-    """A mission that this program has written; None if it is something else."""
+def _tasks_of_mission(name: str, data: bytes) -> TaskList | None:
+    """Tasks and fleet of a mission that this program has written; None if it is something else."""
+    from sb3_uav.web.schemas import TasksIn, UavIn, one_sentence
+
     try:
         document = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{name}: this is not JSON ({str(error)[:200]}).") from error
+    except (ValueError, RecursionError):
+        # The other readers say it better.
+        return None
     if not isinstance(document, dict) or document.get("format") != "sb3-uav mission":
         return None
-    from sb3_uav.missions.plan_file import plan_from_json
-
-    plan = plan_from_json(document, name)
-    return replace(plan.tasks, fleet=plan.fleet)
-
-
-def _read_fleet(name: str, data: bytes) -> Fleet:
-    if util.find_spec("sb3_uav.missions.read") is None:
-        raise ValueError(f"{name}: this installation reads no files of fleets yet.")
-    read: Any = import_module("sb3_uav.missions.read")
-    if hasattr(read, "read_fleet_from_bytes"):
-        found: Fleet = read.read_fleet_from_bytes(name, data)
-        return found
-    with tempfile.TemporaryDirectory() as folder:
-        # Under a name of ours: the name of the upload never becomes a path.
-        path = Path(folder) / "fleet.csv"
-        path.write_bytes(data)
-        try:
-            return replace(read.read_fleet(path), source=name)
-        except ValueError as error:
-            raise ValueError(str(error).replace(str(path), name)) from None
+    try:
+        kept = ("system", "meters_per_unit", "depot", "source", "tasks")
+        tasks = TasksIn.model_validate({key: document[key] for key in kept if key in document})
+        uavs = [UavIn.model_validate(uav).model_dump() for uav in document.get("fleet") or ()]
+    except (ValidationError, TypeError) as error:
+        text = one_sentence(error) if isinstance(error, ValidationError) else str(error)
+        raise ValueError(f"{name}: this is no intact mission: {text}") from None
+    found, fleet = problem_of({"tasks": tasks.model_dump(), "uavs": uavs})
+    return replace(found, fleet=fleet if uavs else None)
 
 
 def _tasks_to_json(tasks: TaskList) -> dict[str, Any]:
@@ -127,6 +117,7 @@ def _tasks_to_json(tasks: TaskList) -> dict[str, Any]:
             }
             for task in range(len(tasks))
         ],
+        "notes": list(tasks.notes),
         "uavs": None if tasks.fleet is None else [_uav_to_json(uav) for uav in tasks.fleet],
     }
 
@@ -177,14 +168,13 @@ def problem_of(problem: dict[str, Any]) -> tuple[TaskList, Fleet]:
 
 
 def _solve(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
+    from sb3_uav.missions.readers.checks import check_tasks
     from sb3_uav.missions.search import solve
     from sb3_uav.web.plan_view import plan_parts
 
     problem = json.loads(blocks[0])
     tasks, fleet = problem_of(problem)
-    if util.find_spec("sb3_uav.missions.readers.checks") is not None:
-        checks: Any = import_module("sb3_uav.missions.readers.checks")
-        checks.check_tasks(tasks, problem["allow_duplicates"])
+    check_tasks(tasks, problem["allow_duplicates"])
     forbidden = [task["id"] for task in problem["tasks"]["tasks"] if task["forbidden"]]
     last = [-_PAUSE]
 
@@ -199,18 +189,13 @@ def _solve(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
 
 def _write(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
     from sb3_uav.missions.plan_file import PLAN_FILE, plan_from_json
+    from sb3_uav.missions.write import write_mission
 
     mission = json.loads(zlib.decompress(blocks[0]))
     plan = replace(plan_from_json(mission, PLAN_FILE), bound=mission.get("bound"))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "mission"
-        if util.find_spec("sb3_uav.missions.write") is None:
-            from sb3_uav.missions.plan_file import save_plan
-
-            save_plan(plan, out / PLAN_FILE)
-        else:
-            write: Any = import_module("sb3_uav.missions.write")
-            write.write_mission(plan, out, FlightOptions(**request["flight"]))
+        write_mission(plan, out, FlightOptions(**request["flight"]))
         data = io.BytesIO()
         with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted(out.rglob("*")):

@@ -34,6 +34,10 @@ async function load() {
     Object.assign(state, { tasks: draft.tasks, uavs: draft.uavs, solve: draft.solve, stale: draft.form.stale === true });
     for (const name of FIELDS) if (typeof draft.form[name] === "string") $(name).value = draft.form[name];
     $("system").value = draft.tasks.system;
+  } else {
+    // Without tiles, there is nothing to find a latitude on.
+    $("system").value = map.tiles ? "wgs84" : "plane";
+    state.tasks = emptyTasks();
   }
   show();
   map.fit();
@@ -150,13 +154,14 @@ async function takeFile(file) {
   if (state.limits && file.size > state.limits.max_body_mb * 2 ** 20) return refuse(new Error(`${file.name} has ${(file.size / 2 ** 20).toFixed(0)} MiB; this server admits ${state.limits.max_body_mb}.`));
   $("tasks-summary").textContent = `Reading ${file.name} …`;
   try {
-    const { uavs, ...tasks } = await ask("POST", `/api/v1/tasks?name=${encodeURIComponent(file.name)}`, file);
+    const { uavs, notes, ...tasks } = await ask("POST", `/api/v1/tasks?name=${encodeURIComponent(file.name)}`, file);
     tasks.tasks.forEach((task) => { task.forbidden = false; });
     Object.assign(state, { tasks, uavs: uavs ?? state.uavs, report: null, solve: null, progress: null, selected: null, mode: null, stale: false });
     $("system").value = tasks.system;
     $("state").textContent = ""; $("progress").hidden = true;
     changed();
     map.fit();
+    if (notes.length) refuse(new Error(notes.join(" ")));
   } catch (error) { refuse(error); show(); }
 }
 
@@ -164,7 +169,9 @@ async function takeFleet(file) {
   if (!file) return;
   refuse(null);
   try {
-    state.uavs = (await ask("POST", `/api/v1/fleets?name=${encodeURIComponent(file.name)}`, file)).uavs;
+    const { uavs, system } = await ask("POST", `/api/v1/fleets?name=${encodeURIComponent(file.name)}`, file);
+    if (system && system !== state.tasks.system && uavs.some((uav) => uav.start || uav.end)) throw new Error(`${file.name}: the starts and ends of these UAVs have other coordinates than the tasks.`);
+    state.uavs = uavs;
     changed();
   } catch (error) { refuse(error); }
 }

@@ -1,12 +1,16 @@
 // A map on a canvas: tasks, routes, depot; moving, zooming, and what lies under the pointer. No outside request, unless there
 // are tiles. Latitudes and longitudes are drawn in the Mercator projection, as tiles are.
 
-export const COLORS = ["#0072b2", "#d55e00", "#009e73", "#c2579a", "#b98900", "#3a9bdc", "#7a5195", "#8c564b", "#4d7c0f", "#b2182b"];
+// Those of all pictures of the package, in the order of the fleet.
+const COLORS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#8c6d31", "#000000"];
+const INKS = ["#fff", "#000", "#fff", "#fff", "#000", "#000", "#fff", "#fff"];
 const DASHES = [[], [9, 5], [2, 5], [12, 4, 2, 4]];
 const TASK_REACH = 13, ROUTE_REACH = 8, MOST_TILES = 256, TILE = 256;
 
+const isDark = matchMedia("(prefers-color-scheme: dark)");
 export const styleOf = (route) => ({
-  color: COLORS[route % COLORS.length],
+  color: isDark.matches && route % COLORS.length === 7 ? "#e0e0e0" : COLORS[route % COLORS.length],
+  ink: isDark.matches && route % COLORS.length === 7 ? "#000" : INKS[route % COLORS.length],
   dash: DASHES[Math.floor(route / COLORS.length) % DASHES.length],
 });
 
@@ -24,7 +28,7 @@ export class MissionMap {
     canvas.addEventListener("pointermove", (event) => this.move(event));
     for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, (event) => this.up(event));
     canvas.addEventListener("keydown", (event) => this.key(event));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    isDark.addEventListener("change", () => this.draw());
     this.resize();
   }
 
@@ -208,9 +212,10 @@ export class MissionMap {
       const arm = Math.max(radius * 0.7, 4);
       pen.beginPath(); pen.moveTo(x - arm, y - arm); pen.lineTo(x + arm, y + arm); pen.moveTo(x + arm, y - arm); pen.lineTo(x - arm, y + arm); pen.stroke();
     } else if (role) {
-      pen.fillStyle = COLORS[role[0] % COLORS.length]; pen.strokeStyle = color("halo"); pen.lineWidth = 1.5;
+      const style = styleOf(role[0]);
+      pen.fillStyle = style.color; pen.strokeStyle = color("halo"); pen.lineWidth = 1.5;
       circle(pen, x, y, radius); pen.fill(); pen.stroke();
-      if (numbered) text(pen, String(role[1]), x, y, "#fff", role[1] > 99 ? 8 : 10);
+      if (numbered) text(pen, String(role[1]), x, y, style.ink, role[1] > 99 ? 8 : 10);
     } else {
       pen.fillStyle = color("halo"); pen.strokeStyle = color("task"); pen.lineWidth = 2;
       circle(pen, x, y, Math.min(radius, 5.5)); pen.fill(); pen.stroke();
