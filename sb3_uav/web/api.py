@@ -16,7 +16,7 @@ from sb3_uav.web.jobs import PARTS, BusyError, Job, Pool
 from sb3_uav.web.limits import MOST_UAVS, Limits
 from sb3_uav.web.schemas import FleetIn, FlightIn, OptionsIn, Progress, SolveIn, Strict, TasksIn, check_text
 
-SOLVERS = {"default": None, "local-search": "local-search", "insertion": "insertion"}
+SOLVERS = {"default": None, "local-search": "local-search", "insertion": "greedy-insertion"}
 # A solve may take this much longer than its time limit: the networks look at no clock.
 _GRACE_SECONDS = 60.0
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from sb3_uav.missions.plan import Plan, Route, Skipped
 from sb3_uav.missions.plan_file import plan_to_json
+from sb3_uav.web.work import in_own_words
 
 
 def plan_parts(plan: Plan, forbidden: Sequence[str] = ()) -> list[bytes]:
@@ -43,7 +44,7 @@ def report_of(plan: Plan, forbidden: Sequence[str] = ()) -> dict[str, Any]:
             *({"id": tasks.ids[skipped.task], **_skipped(skipped)} for skipped in plan.skipped),
             *({"id": name, "reason": "forbidden", "missing_m": None, "text": "forbidden by you"} for name in forbidden),
         ],
-        "remarks": list(plan.remarks),
+        "remarks": [in_own_words(remark) for remark in plan.remarks],
         "solver": plan.solver,
         "seed": plan.seed,
         "seconds": plan.seconds,

@@ -139,7 +139,9 @@ class SolveIn(Strict):
 
 
 class FlightIn(Strict):
-    """How the mission is flown, for the files of the download."""
+    """How the mission is flown, for the files of the download. Of a query, where numbers are text."""
+
+    model_config = ConfigDict(strict=False)
 
     altitude_m: float = Field(default=50.0, gt=0, le=10_000)
     altitude_step_m: float = Field(default=10.0, ge=0, le=1_000)

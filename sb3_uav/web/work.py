@@ -23,6 +23,24 @@ from sb3_uav.web.workers import Message, Send
 
 # Better plans follow each other within milliseconds at the beginning; a person sees a few a second.
 _PAUSE = 0.2
+# What sentences for the command line call the fields of the page and of the API.
+_WORDS = {
+    "give --depot LAT,LON": "give one",
+    "give --depot": "give one",
+    "give --allow-duplicates": "allow several tasks at one place (allow_duplicates)",
+    "give --speed, or speed_mps in the file of the fleet": "give speed_mps",
+    "--reserve PERCENT": "reserve_percent",
+}
+
+
+def in_own_words(sentence: str) -> str:
+    """
+    :param sentence: A sentence that may name options of ``sb3-uav solve``
+    :return: The same for people who use the page or the API
+    """
+    for option, word in _WORDS.items():
+        sentence = sentence.replace(option, word)
+    return sentence
 
 
 @cache
@@ -48,7 +66,10 @@ def do(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
     :return: The last result
     :raises ValueError: If the input is wrong
     """
-    return {"read": _read, "solve": _solve, "write": _write}[request["kind"]](request, blocks, send)
+    try:
+        return {"read": _read, "solve": _solve, "write": _write}[request["kind"]](request, blocks, send)
+    except ValueError as error:
+        raise ValueError(in_own_words(str(error))) from error
 
 
 def _read(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:

@@ -19,7 +19,7 @@ async function save() {
   saving = true;
   try {
     const form = Object.fromEntries(FIELDS.map((name) => [name, $(name).value]));
-    await ask("PUT", "/session", { tasks: state.tasks, uavs: state.uavs, solve: state.solve, form: { ...form, stale: state.stale } });
+    await ask("PUT", "/session", { tasks: state.tasks, uavs: state.uavs, solve: state.solve, form: { ...form, stale: state.stale, duplicates: $("duplicates").checked } });
   } catch (error) { refuse(error); }
   saving = false;
   if (again) { again = false; save(); }
@@ -33,6 +33,7 @@ async function load() {
   if (draft) {
     Object.assign(state, { tasks: draft.tasks, uavs: draft.uavs, solve: draft.solve, stale: draft.form.stale === true });
     for (const name of FIELDS) if (typeof draft.form[name] === "string") $(name).value = draft.form[name];
+    $("duplicates").checked = draft.form.duplicates === true;
     $("system").value = draft.tasks.system;
   } else {
     // Without tiles, there is nothing to find a latitude on.
@@ -154,7 +155,7 @@ async function takeFile(file) {
   if (state.limits && file.size > state.limits.max_body_mb * 2 ** 20) return refuse(new Error(`${file.name} has ${(file.size / 2 ** 20).toFixed(0)} MiB; this server admits ${state.limits.max_body_mb}.`));
   $("tasks-summary").textContent = `Reading ${file.name} …`;
   try {
-    const { uavs, notes, ...tasks } = await ask("POST", `/api/v1/tasks?name=${encodeURIComponent(file.name)}`, file);
+    const { uavs, notes, ...tasks } = await ask("POST", `/api/v1/tasks?name=${encodeURIComponent(file.name)}&allow_duplicates=${$("duplicates").checked}`, file);
     tasks.tasks.forEach((task) => { task.forbidden = false; });
     Object.assign(state, { tasks, uavs: uavs ?? state.uavs, report: null, solve: null, progress: null, selected: null, mode: null, stale: false });
     $("system").value = tasks.system;
@@ -198,7 +199,7 @@ function fleet() {
 async function solve() {
   refuse(null);
   try {
-    const options = { time_limit: field("time", "The time"), seed: field("seed", "The seed") };
+    const options = { time_limit: field("time", "The time"), seed: field("seed", "The seed"), allow_duplicates: $("duplicates").checked };
     state.progress = await ask("POST", "/api/v1/solves", { tasks: state.tasks, fleet: fleet(), options });
     state.solve = state.progress.id; state.stale = false; state.selected = null; state.mode = null;
     show();
@@ -312,6 +313,7 @@ $("split").addEventListener("click", () => {
   } catch (error) { refuse(error); }
 });
 for (const name of FIELDS) $(name).addEventListener("change", () => { if (["count", "range", "range-unit", "speed", "reserve"].includes(name)) changed(); else { showResult(); save(); } });
+$("duplicates").addEventListener("change", save);
 $("solve").addEventListener("click", solve);
 $("cancel").addEventListener("click", async () => { try { state.progress = await ask("DELETE", `/api/v1/solves/${encodeURIComponent(state.solve)}`); showProgress(); show(); } catch (error) { refuse(error); } });
 $("zoom-in").addEventListener("click", () => map.zoom(1.5));
