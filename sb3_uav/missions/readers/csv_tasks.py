@@ -115,7 +115,7 @@ def _name(cells: Cells, row: int, number: int) -> str:
         return str(number)
     name = cells.text(row, "id")
     if not name:
-        raise ValueError(f"{cells.where(row)}: {cells.columns['id'].title} is missing; give every task a name.")
+        raise ValueError(f"{cells.where(row)}: {cells.columns['id'].title} is missing; fill the cell.")
     return name
 
 

@@ -22,6 +22,8 @@ from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.readers.checks import MAX_TASKS, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
 
+# 100,000 tasks take less than half; vrplib is slow.
+_MOST_TEXT_BYTES = 8 * 2**20
 # Of all arrays of a file together; deflate packs a thousandfold.
 _MOST_NPZ_BYTES = 256 * 2**20
 _MOST_NPZ_ARRAYS = 100
@@ -37,7 +39,7 @@ def read_chao_tasks(data: bytes, source: str, meters_per_unit: float = 1.0) -> T
     :return: The tasks, named by the number of their point, and the fleet
     :raises ValueError: If it is damaged; the message names the line
     """
-    instance = read_chao(Path(source), _text(data), "")
+    instance = read_chao(Path(source), _text(data, source), "")
     return _task_list(
         instance.instances, instance.nodes, [f"row {node + _CHAO_HEADER}" for node in instance.nodes], source, meters_per_unit
     )
@@ -54,7 +56,7 @@ def read_oplib_tasks(data: bytes, source: str, meters_per_unit: float = 1.0) -> 
     :raises ValueError: If it is damaged, or its metric is not EUC_2D
     :raises ImportError: If vrplib is not installed
     """
-    instance = read_oplib(Path(source), _text(data), "")
+    instance = read_oplib(Path(source), _text(data, source), "")
     return _task_list(instance.instances, instance.nodes, [f"node {node}" for node in instance.nodes], source, meters_per_unit)
 
 
@@ -99,7 +101,9 @@ def _check_npz_size(data: bytes, source: str) -> None:
         )
 
 
-def _text(data: bytes) -> str:
+def _text(data: bytes, source: str) -> str:
+    if len(data) > _MOST_TEXT_BYTES:
+        raise ValueError(f"{source}: the file has {len(data)} bytes; at most {_MOST_TEXT_BYTES} of an instance are read.")
     # Comments may be in any encoding; where numbers are damaged, the readers say so.
     return data.decode("utf-8-sig", errors="replace")
 

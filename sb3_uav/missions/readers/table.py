@@ -13,6 +13,7 @@ _MOST_COLUMNS = 1_000
 # Blank ones, and those within quotes, are no rows, but take time too.
 _MOST_LINES = 500_000
 _MOST_IN_LINE = 100_000
+_MOST_LINES_OF_RECORD = 100
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
@@ -121,26 +122,55 @@ def _records(text: str, delimiter: str, source: str) -> Iterator[tuple[int, list
     :return: Line where each record begins, and its cells; without those that are empty
     :raises ValueError: If the text is no CSV
     """
-    reader = csv.reader(_lines(text, source), delimiter=delimiter, strict=True)
+    lines = _Lines(text, source)
+    reader = csv.reader(lines, delimiter=delimiter, strict=True)
     while True:
-        line = reader.line_num + 1
+        row = lines.begin_record()
         try:
             record = next(reader)
         except StopIteration:
             return
         except csv.Error as error:
-            raise ValueError(f"{source}: row {line}: this is no CSV ({error}); look for a quote that is not closed.") from None
+            raise ValueError(f"{source}: row {row}: this is no CSV ({error}); look for a quote that is not closed.") from None
         cells = [cell.strip() for cell in record]
         if any(cells):
-            yield line, cells
+            yield row, cells
 
 
-def _lines(text: str, source: str) -> Iterator[str]:
-    # Without translation, so that every kind of line end counts once.
-    for row, line in enumerate(io.StringIO(text, newline=""), start=1):
+class _Lines:
+    """
+    The lines of a text, in bounds that keep every record small.
+
+    :param text: The text
+    :param source: Its name, for errors
+    """
+
+    def __init__(self, text: str, source: str) -> None:
+        # Without translation, so that every kind of line end counts once.
+        self._lines = io.StringIO(text, newline="")
+        self._source = source
+        self._n_read = 0
+        self._record = 1
+
+    def begin_record(self) -> int:
+        """:return: The line where a record begins, from 1"""
+        self._record = self._n_read + 1
+        return self._record
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        line = next(self._lines)
+        self._n_read += 1
         if len(line) > _MOST_IN_LINE:
-            raise ValueError(f"{source}: row {row}: there are {len(line)} characters in the line; is this a CSV?")
-        yield line
+            raise ValueError(f"{self._source}: row {self._n_read}: {len(line)} characters are in the line; is this a CSV?")
+        if self._n_read >= self._record + _MOST_LINES_OF_RECORD:
+            raise ValueError(
+                f"{self._source}: row {self._record}: more than {_MOST_LINES_OF_RECORD} lines are in quotes; look for a quote "
+                "that is not closed."
+            )
+        return line
 
 
 def _fitted(cells: list[str], n_columns: int, delimiter: str, where: str) -> tuple[str, ...]:
