@@ -200,6 +200,7 @@ ROW = "1\t0\t3\t16\t0\t0\t0\t0\t47.1\t8.1\t50\t1\n"
         ("QGC WPL 110\n" + HOME + ROW.replace("\t3\t", "\t-3\t"), "line 3: frame is -3"),
         ("QGC WPL 110\n" + HOME + ROW.replace("\t16\t0", "\t177\t0"), "line 3 jumps to another item"),
         ("QGC WPL 110\n" + HOME + ROW.replace("\t16\t0", "\t16\t-1"), "line 3: the hold is -1 s"),
+        ("QGC WPL 110" + "\n" * 1_000_001, "the file has more than 1000000 lines"),
         ("QGC WPL 110\n" + HOME + "1" * 10**6, "line 3 is '11"),
         ("QGC WPL 110\n" + HOME + ROW + "\0", r"line 4 is '\\x00'"),
     ],

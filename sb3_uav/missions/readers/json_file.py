@@ -9,6 +9,8 @@ import unicodedata
 from typing import Any, NoReturn
 
 _LONGEST_ID = 200
+# Values that a file may have, each of which takes many times its bytes once read. A file of 100,000 tasks has half as many.
+_MOST_VALUES = 3_000_000
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
 _SHORT.maxlist = _SHORT.maxdict = 4
@@ -40,12 +42,18 @@ def parse_json(data: bytes, source: str) -> dict[str, Any]:
         raise ValueError(f"{constant} is no number of JSON")
 
     text = decode_utf8(data, source)
+    if text.count(",") >= _MOST_VALUES:
+        raise ValueError(f"{source}: the file has more than {_MOST_VALUES} values; divide it.")
     try:
         content = json.loads(text, parse_constant=refuse)
     except RecursionError as error:
         raise ValueError(f"{source}: lists or objects are nested too deeply; this is no file of tasks.") from error
-    except ValueError as error:
+    except json.JSONDecodeError as error:
         raise ValueError(f"{source}: this is not JSON ({error}).") from error
+    except ValueError as error:
+        # Python refuses to read thousands of digits, for the time that it would take.
+        what = error if "JSON" in str(error) else "a number has thousands of digits"
+        raise ValueError(f"{source}: this is not JSON ({what}).") from error
     if not isinstance(content, dict):
         raise ValueError(f"{source}: there is {shown(content)} where an object of JSON is expected.")
     return content

@@ -22,6 +22,7 @@ _FIELDS = (
 )  # fmt: skip
 # Much longer than 12 numbers need.
 _LONGEST_LINE = 1000
+_MOST_LINES = 1_000_000
 
 
 def read_wpl(data: bytes, source: str) -> TaskList:
@@ -35,7 +36,10 @@ def read_wpl(data: bytes, source: str) -> TaskList:
     :return: The tasks in the order of the file, coordinates not checked for their range
     :raises ValueError: If something is wrong or cannot be honored; the message names the line, counted from 1
     """
-    lines = re.split("\r\n|\n|\r", decode_utf8(data, source))
+    text = decode_utf8(data, source)
+    if text.count("\n") + text.count("\r") > _MOST_LINES:
+        raise ValueError(f"{source}: the file has more than {_MOST_LINES} lines; divide it.")
+    lines = re.split("\r\n|\n|\r", text)
     if lines[0].split() != HEADER.split():
         raise ValueError(f"{source}: line 1 is {shown(lines[0])}; files of waypoints begin with {HEADER!r}.")
     items = [
