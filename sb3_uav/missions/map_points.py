@@ -10,6 +10,9 @@ from sb3_uav.missions.labels import flies
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.tasks import TaskList
 
+# How many times larger than what is flown the map may be.
+_MAX_RATIO = 5.0
+
 
 class MapPoints(NamedTuple):
     """
@@ -18,13 +21,33 @@ class MapPoints(NamedTuple):
     :param tasks: ``(n, 2)``
     :param routes: ``(n_stops + 2, 2)`` of every UAV, start, stops and end; of a UAV that stays where it is the start twice
     :param spacing: How far a stop typically is from the one that is nearest to it, 0 with less than 2 stops
-    :param extent: The longer side of the smallest rectangle around everything, not 0
+    :param focus: ``(2, 2)``, the lower left and the upper right corner of what is flown, with the depot
+    :param whole: The same of everything
     """
 
     tasks: np.ndarray
     routes: tuple[np.ndarray, ...]
     spacing: float
-    extent: float
+    focus: np.ndarray
+    whole: np.ndarray
+
+    @property
+    def is_focused(self) -> bool:
+        """Whether a map of everything would show too little of what is flown, because some tasks lie far away."""
+        flown, everything = (float(np.ptp(corners, axis=0).max()) for corners in (self.focus, self.whole))
+        return 0 < flown * _MAX_RATIO < everything
+
+    @property
+    def extent(self) -> float:
+        """The longer side in meters of what a map shows at first, not 0."""
+        corners = self.focus if self.is_focused else self.whole
+        return float(np.ptp(corners, axis=0).max()) or 1.0
+
+    @property
+    def n_outside(self) -> int:
+        """How many tasks are not on what a map shows at first."""
+        low, high = self.focus
+        return int((~((self.tasks >= low) & (self.tasks <= high)).all(axis=1)).sum()) if self.is_focused else 0
 
 
 def map_points(plan: Plan) -> MapPoints:
@@ -35,10 +58,11 @@ def map_points(plan: Plan) -> MapPoints:
     """
     tasks = from_depot(plan.tasks, plan.tasks.points)
     routes = tuple(_grounded(route, from_depot(plan.tasks, route.points)) for route in plan.routes)
-    everything = np.vstack([np.zeros((1, 2)), tasks, *routes])
-    extent = float(np.ptp(everything, axis=0).max()) or 1.0
+    flown = np.vstack([np.zeros((1, 2)), *routes])
+    everything = np.vstack([flown, tasks])
+    focus, whole = (np.array([points.min(axis=0), points.max(axis=0)]) for points in (flown, everything))
     stops = tasks[[stop for route in plan.routes for stop in route.stops]]
-    return MapPoints(tasks, routes, spacing_of(stops), extent)
+    return MapPoints(tasks, routes, spacing_of(stops), focus, whole)
 
 
 def from_depot(tasks: TaskList, points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@
   const DIMMED = 0.12;
   const NEAR = 8; // Pixels between a click and the line that it means.
   const STILL = 5; // Pixels that a pointer may move in a click.
+  const PAUSE = 120; // Milliseconds.
+  let pause = 0;
   let lit = null;
   let size = null;
 
@@ -16,10 +18,11 @@
 
   function light(uav) {
     lit = uav === lit ? null : uav;
-    const shines = (trace) => lit === null || trace.meta.uav === lit || ["depot", "key"].includes(trace.meta.role);
-    Plotly.restyle(map, { opacity: map.data.map((trace) => (shines(trace) ? 1 : DIMMED)) });
-    const tours = of("tour");
-    Plotly.restyle(map, { "line.width": tours.map((index) => (map.data[index].meta.uav === lit ? 4.5 : 2.5)) }, tours);
+    const shines = ({ meta }) => lit === null || meta.uav === lit || ["depot", "key"].includes(meta.role);
+    Plotly.restyle(map, {
+      opacity: map.data.map((trace) => (shines(trace) ? 1 : DIMMED)),
+      "line.width": map.data.map(({ meta }) => (meta.role === "tour" ? (meta.uav === lit ? 4.5 : 2.5) : undefined)),
+    });
     for (const button of buttons) {
       const on = Number(button.dataset.uav) === lit;
       button.setAttribute("aria-pressed", String(on));
@@ -37,23 +40,20 @@
   // Stops are as large as the distance between them allows; where they are large enough, they are numbered and legs have
   // arrows.
   function resize() {
-    const [smallest, largest, numbered, share, arrow] = page.sizes;
+    const [smallest, largest, numbered, share] = page.sizes;
     const room = page.spacing > 0 ? page.spacing * share * pixelsPerMeter() : largest;
     const wanted = Math.round(Math.min(Math.max(room, smallest), largest));
     if (wanted === size) return;
     size = wanted;
-    const text = size >= numbered;
-    const stops = of("stops");
-    Plotly.restyle(
-      map,
-      { mode: text ? "markers+text" : "markers", "marker.size": size, "textfont.size": Math.max(9, Math.round(size * 0.55)) },
-      stops,
-    );
-    const skipped = of("skipped");
-    if (skipped.length > 0) Plotly.restyle(map, { "marker.size": Math.min(size, 9) }, skipped);
-    const tours = of("tour");
-    const arrows = tours.map((index) => map.data[index].x.map((_, point) => (text && point % 2 ? arrow : 0)));
-    Plotly.restyle(map, { "marker.size": arrows }, tours);
+    const hasText = size >= numbered;
+    const modes = hasText ? { stops: "markers+text", tour: "lines+markers" } : { stops: "markers", tour: "lines" };
+    const sizes = { stops: size, skipped: Math.min(size, page.largestSkipped) };
+    // One call for all traces, because each call draws everything. What is undefined stays as it is.
+    Plotly.restyle(map, {
+      mode: map.data.map(({ meta }) => modes[meta.role]),
+      "marker.size": map.data.map(({ meta }) => sizes[meta.role]),
+      "textfont.size": map.data.map(({ meta }) => (meta.role === "stops" ? Math.max(8, Math.round(size * 0.55)) : undefined)),
+    });
   }
 
   function drawScale() {
@@ -117,7 +117,9 @@
     for (const button of buttons) button.addEventListener("click", () => light(Number(button.dataset.uav)));
     map.on("plotly_afterplot", () => {
       drawScale();
-      resize();
+      // While somebody zooms, there is a plot after every turn of the wheel.
+      window.clearTimeout(pause);
+      pause = window.setTimeout(resize, PAUSE);
     });
   }
 
@@ -127,7 +129,9 @@
     responsive: true,
     scrollZoom: true,
     displaylogo: false,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    plotlyServerURL: "",
+    // Those that plotly adds by itself differ between its versions, and some share the figure with a service.
+    modeBarButtons: [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
     toImageButtonOptions: { filename: "map", scale: 2 },
   };
   Plotly.newPlot(map, data, layout, config).then(() => {

@@ -32,14 +32,20 @@ if TYPE_CHECKING:
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # Pixels: stops with and without a number in them, and how much of the distance between two stops one may fill.
-LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 14.0, 0.9
-ARROW = 13.0
+LARGEST_STOP, SMALLEST_STOP, NUMBERED_STOP, STOP_SHARE = 20.0, 6.0, 12.0, 0.9
+# Tasks that are left out must not outshine the stops.
+LARGEST_SKIPPED = 9.0
+_ARROW, _ARROW_AT = 13.0, 0.56
 # What a figure is large that nobody has resized.
 _WIDTH = 700.0
 _LEGEND_CHARACTERS = 24
 _GRAY, _RED = "#7d838a", "#B3261E"
 _MUST_SYMBOL = "square"
-_REASON_SYMBOLS: dict[Reason, str] = {"did not fit": "circle-open", "out of reach": "x-thin", "worth nothing": "circle-dot"}
+_REASON_SYMBOLS: dict[Reason, str] = {
+    "did not fit": "circle-open",
+    "out of reach": "x-thin",
+    "worth nothing": "circle-open-dot",
+}
 _SITES = {"start": "triangle-right", "end": "x", "start and end": "triangle-up"}
 
 
@@ -60,14 +66,14 @@ def plan_figure(plan: Plan) -> go.Figure:
     points = map_points(plan)
     size = stop_size(points.spacing * _WIDTH / points.extent)
     traces = [
-        *(_tour(plan, uav, points) for uav in range(len(plan.routes))),
+        *(_tour(plan, uav, points, size) for uav in range(len(plan.routes))),
         *_skipped(plan, points, size),
         *(_stops(plan, uav, points, size) for uav in range(len(plan.routes))),
         *(_entry(plan, uav, points) for uav in range(len(plan.routes))),
         *_keys(plan),
         _depot(plan),
     ]
-    return go.Figure([go.Scatter(trace) for trace in traces], _layout(plan))
+    return go.Figure([go.Scatter(trace) for trace in traces], _layout(plan, points))
 
 
 def stop_size(spacing: float) -> float:
@@ -79,23 +85,16 @@ def stop_size(spacing: float) -> float:
     return min(max(spacing * STOP_SHARE, SMALLEST_STOP), LARGEST_STOP) if spacing > 0 else LARGEST_STOP
 
 
-def skipped_size(size: float) -> float:
-    """
-    :param size: Of :func:`stop_size`
-    :return: Diameter of a task that is left out, which must not outshine the stops
-    """
-    return min(size, 9.0)
-
-
 def _text(name: str, limit: int = 60) -> str:
     """A name for plotly, which shows some tags and does not know all entities."""
     return html.escape(shown(name, limit), quote=False)
 
 
-def _tour(plan: Plan, uav: int, points: MapPoints) -> dict[str, Any]:
-    """The line of a UAV, with a point in the middle of every leg for the arrow and for hovering."""
+def _tour(plan: Plan, uav: int, points: MapPoints, size: float) -> dict[str, Any]:
+    """The line of a UAV, with one more point on every leg for the arrow and for hovering."""
     route, corners = plan.routes[uav], points.routes[uav]
-    middles = (corners[:-1] + corners[1:]) / 2
+    # A bit beyond the middle, so that two arrows on the way out and back to the same stop do not meet.
+    middles = corners[:-1] + _ARROW_AT * (corners[1:] - corners[:-1])
     path = np.empty((len(corners) + len(middles), 2))
     path[::2], path[1::2] = corners, middles
     hover: list[str] = [""] * len(path)
@@ -108,7 +107,7 @@ def _tour(plan: Plan, uav: int, points: MapPoints) -> dict[str, Any]:
         for leg in range(len(middles))
     ]
     return {
-        "mode": "lines+markers",
+        "mode": "lines+markers" if size >= NUMBERED_STOP else "lines",
         "x": _rounded(path[:, 0]) if flies(route) else [],
         "y": _rounded(path[:, 1]) if flies(route) else [],
         **_of_uav(plan, uav),
@@ -117,8 +116,9 @@ def _tour(plan: Plan, uav: int, points: MapPoints) -> dict[str, Any]:
         "marker": {
             "symbol": "arrow",
             "angleref": "previous",
-            "size": [ARROW * (point % 2) for point in range(len(path))] if flies(route) else [],
+            "size": [_ARROW * (point % 2) for point in range(len(path))] if flies(route) else [],
             "color": uav_color(uav),
+            "opacity": 1,
             "line": {"width": 0},
         },
         "text": hover if flies(route) else [],
@@ -262,7 +262,7 @@ def _skipped(plan: Plan, points: MapPoints, size: float) -> Iterator[dict[str, A
             "legendrank": 1001,
             "marker": {
                 "symbol": [f"{_MUST_SYMBOL}-{'x-' if symbol == 'x-thin' else ''}open" if first else symbol for first in must],
-                "size": skipped_size(size),
+                "size": min(size, LARGEST_SKIPPED),
                 "color": [_RED if first else _GRAY for first in must],
                 "line": {"width": 1.7, "color": [_RED if first else _GRAY for first in must]},
             },
@@ -321,7 +321,7 @@ def _depot(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _layout(plan: Plan) -> dict[str, Any]:
+def _layout(plan: Plan, points: MapPoints) -> dict[str, Any]:
     directions = ("east of", "north of") if plan.tasks.system == "wgs84" else ("in x from", "in y from")
     axis = {
         "showgrid": True,
@@ -335,20 +335,26 @@ def _layout(plan: Plan) -> dict[str, Any]:
         "tickcolor": "#b8bcc2",
         "exponentformat": "none",
     }
+    ranges: list[dict[str, Any]] = [{}, {}]
+    if points.is_focused:
+        low, high = points.focus
+        margin = 0.06 * max(float((high - low).max()), 1.0)
+        ranges = [{"range": [float(low[row] - margin), float(high[row] + margin)]} for row in (0, 1)]
     return {
         "template": "none",
         "title": {"text": f"{_text(plan.tasks.source)}<br><sup>{headline(plan)}</sup>", "x": 0.02, "xanchor": "left"},
         "font": {"family": FONT, "size": 13, "color": "#1d2125"},
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#fafbfc",
-        "xaxis": {**axis, "title": {"text": f"meters {directions[0]} the depot", "standoff": 8}},
+        "xaxis": {**axis, **ranges[0], "title": {"text": f"meters {directions[0]} the depot", "standoff": 8}},
         "yaxis": {
             **axis,
+            **ranges[1],
             "title": {"text": f"meters {directions[1]} the depot", "standoff": 8},
             "scaleanchor": "x",
             "scaleratio": 1,
         },
-        "legend": {"groupclick": "togglegroup", "itemsizing": "constant", "font": {"size": 12}, "tracegroupgap": 0},
+        "legend": {"groupclick": "togglegroup", "itemwidth": 40, "font": {"size": 12}, "tracegroupgap": 0},
         "hovermode": "closest",
         "hoverlabel": {"align": "left", "font": {"family": FONT, "size": 13}},
         "dragmode": "pan",

@@ -28,7 +28,7 @@ from sb3_uav.missions.map_points import map_points
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.remarks import REVIEW
 from sb3_uav.missions.writers.map_figure import (
-    ARROW,
+    LARGEST_SKIPPED,
     LARGEST_STOP,
     NUMBERED_STOP,
     SMALLEST_STOP,
@@ -83,8 +83,9 @@ def map_page(plan: Plan) -> str:
             _remarks(plan),
             '<div class="frame"><div id="map"></div><div id="scale" class="scale"></div></div>',
             "<noscript><p>The map needs JavaScript; the tables do not.</p></noscript>",
+            _outside(plan),
             '<p class="hint">Click a tour or a stop to light up its UAV, and again to reset. Click the legend to hide a UAV. '
-            "Scroll to zoom, drag to move, double-click to see everything.</p>",
+            "Scroll to zoom, which also numbers stops that lie close together; drag to move, double-click to see everything.</p>",
             _routes_table(plan),
             _skipped_table(plan),
             f'<p class="made">{_made_by(plan)}</p>',
@@ -132,7 +133,8 @@ def _page_data(plan: Plan) -> str:
     data = {
         "figure": figure,
         "spacing": map_points(plan).spacing,
-        "sizes": [SMALLEST_STOP, LARGEST_STOP, NUMBERED_STOP, STOP_SHARE, ARROW],
+        "sizes": [SMALLEST_STOP, LARGEST_STOP, NUMBERED_STOP, STOP_SHARE],
+        "largestSkipped": LARGEST_SKIPPED,
     }
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -145,6 +147,14 @@ def _remarks(plan: Plan) -> str:
     if len(others) > _MAX_REMARKS:
         lines.append(f"<p>And {count(len(others) - _MAX_REMARKS, 'more remark')}, in summary.json.</p>")
     return f'<div class="remarks" role="note">{"".join(lines)}</div>'
+
+
+def _outside(plan: Plan) -> str:
+    n_outside = map_points(plan).n_outside
+    if not n_outside:
+        return ""
+    verb = "lies" if n_outside == 1 else "lie"
+    return f'<p class="outside">{count(n_outside, "task")} {verb} far away, outside of this view. Double-click to see all.</p>'
 
 
 def _routes_table(plan: Plan) -> str:
