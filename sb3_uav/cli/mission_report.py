@@ -40,13 +40,8 @@ def print_plan(plan: Plan, files: Sequence[Path], console: Any = None) -> None:
 
     tasks = plan.tasks
     write(
-        f"{plan.n_served} of {len(tasks)} tasks served, value {plan.objective:g} of {tasks.values.sum():g}, "
-        f"{meters(plan.length_m)} flown"
-        + (
-            f", at most {plan.bound:g} possible (gap {plan.gap:.1%})"
-            if plan.bound is not None and plan.gap is not None
-            else ""
-        ),
+        f"{plan.n_served:,} of {count(len(tasks), 'task')} served, value {number(plan.objective)} of "
+        f"{number(float(tasks.values.sum()))}, {meters(plan.length_m)} flown{_proof(plan)}",
         "bold",
     )
     console.print(_table(rich, plan))

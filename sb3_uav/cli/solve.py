@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -115,7 +116,7 @@ def _joined(argv: Sequence[str]) -> list[str]:
     """argparse takes a southern latitude for an option: ``--depot -33,151`` becomes ``--depot=-33,151``."""
     joined: list[str] = []
     for word in argv:
-        if joined and joined[-1] == "--depot":
+        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z-]+", joined[-1]):
             joined[-1] += f"={word}"
         else:
             joined.append(word)
@@ -132,23 +133,20 @@ def main(argv: Sequence[str]) -> int:
     """
     args = _make_parser().parse_args(_joined(argv))
     from sb3_uav.cli.mission_report import Progress, exit_code, print_plan
-    from sb3_uav.evaluation.table import require_rich
     from sb3_uav.missions.fleet_options import FleetOptions
     from sb3_uav.missions.read import read_tasks
     from sb3_uav.missions.search import solve
     from sb3_uav.missions.write import check_folder, checked, write_mission
 
     # What may be missing or wrong is found before the long run, not after it.
-    require_rich()
+    require("rich", "The summary of a mission", "missions")
     require("matplotlib", "The map of a mission", "missions")
     require("plotly", "The map of a mission", "missions")
     if not 0 < args.time_limit < math.inf:
         raise ValueError(f"--time-limit is {args.time_limit:g}; give a number of seconds above 0.")
     flight = flight_of(args)
     check_folder(args.out, args.overwrite)
-    tasks = read_tasks(
-        args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row
-    )
+    tasks = read_tasks(args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row)
     options = FleetOptions(args.fleet, args.uavs, args.range, args.endurance, args.speed, args.reserve)
     fleet = options.fleet(tasks)
     with Progress(args.time_limit) as progress:

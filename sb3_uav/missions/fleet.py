@@ -19,6 +19,7 @@ class Uav:
     :param start: Where it is, in the user's coordinates; at the depot when None
     :param end: Where it has to land, in the user's coordinates; at the depot when None
     :param reserve_percent: Part of the range that no plan may use
+    :param full_range_m: How far it flies with a full battery, in meters, if that is more than ``range_m``
     """
 
     id: str
@@ -27,6 +28,7 @@ class Uav:
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
     reserve_percent: float = 0.0
+    full_range_m: float | None = None
 
     @property
     def usable_m(self) -> float:

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sb3_uav.missions.fleet import Fleet
+from sb3_uav.missions.read import read_fleet
+from sb3_uav.missions.readers.checks import check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
+from sb3_uav.missions.units import parse_duration, parse_length, parse_speed
 
-# More would be a slip of the keyboard.
-_MAX_UAVS = 1000
 _SAY_IT = "say --uavs 4 --range 12km (or --endurance 25min --speed 12m/s), or give a --fleet file"
 
 
@@ -38,22 +39,23 @@ class FleetOptions:
     def fleet(self, tasks: TaskList) -> Fleet:
         """
         :param tasks: The tasks, whose file may say which UAVs there are
-        :return: The fleet
+        :return: The fleet, checked
         :raises OSError: If the file cannot be read
         :raises ValueError: If an option or the file is wrong, or nothing says which UAVs there are
         """
+        fleet = self._fleet(tasks)
+        check_fleet(fleet)
+        check_fits(tasks, fleet)
+        return fleet
+
+    def _fleet(self, tasks: TaskList) -> Fleet:
         if not 0 <= self.reserve_percent < 100:
             raise ValueError(f"--reserve is {self.reserve_percent:g}; give a percentage of the range from 0 to below 100.")
-        # Imported here, because files need more than a fleet of equal UAVs does.
-        from sb3_uav.missions.units import parse_speed
-
         speed = _positive("--speed", self.speed, parse_speed)
         is_described = any(option is not None for option in (self.uavs, self.range, self.endurance))
         if self.file is not None:
             if is_described:
                 raise ValueError("--fleet says it all; leave out --uavs, --range and --endurance.")
-            from sb3_uav.missions.read import read_fleet
-
             return self._completed(read_fleet(self.file), speed)
         if is_described:
             return self._equal(speed)
@@ -73,12 +75,9 @@ class FleetOptions:
         return replace(fleet, uavs=tuple(uavs))
 
     def _equal(self, speed: float | None) -> Fleet:
-        from sb3_uav.missions.units import parse_duration, parse_length
-
         if self.uavs is None:
             raise ValueError(f"--uavs, the number of UAVs, is missing; {_SAY_IT}.")
-        if not 1 <= self.uavs <= _MAX_UAVS:
-            raise ValueError(f"--uavs is {self.uavs}; give a number from 1 to {_MAX_UAVS}.")
+        check_fleet_size(self.uavs, "--uavs")
         reach = _positive("--range", self.range, parse_length)
         endurance = _positive("--endurance", self.endurance, parse_duration)
         if reach is not None and endurance is not None:

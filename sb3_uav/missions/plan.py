@@ -87,6 +87,9 @@ class Plan:
     :param seed: Seed of the solver
     :param seconds: Wall time of the solver
     :param bound: A proven upper bound of the objective; None if there is none
+    :param past_tasks: Names of tasks that earlier plans of this mission had, done or dropped since
+    :param past_uavs: Names of UAVs that earlier plans had, lost since
+    :param notes: What had to be assumed in making it, a sentence each; remarks begin with them
     :param remarks: What a person should know before flying it, a sentence each
     :param time_limit: Seconds that the solver was given; None if nobody said
     """
@@ -101,6 +104,9 @@ class Plan:
     seed: int
     seconds: float
     bound: float | None = None
+    past_tasks: tuple[str, ...] = ()
+    past_uavs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     time_limit: float | None = None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,7 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
                 "start": None if uav.start is None else list(uav.start),
                 "end": None if uav.end is None else list(uav.end),
                 "reserve_percent": uav.reserve_percent,
+                "full_range_m": uav.full_range_m,
             }
             for uav in plan.fleet
         ],
@@ -59,6 +61,7 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
         "seed": plan.seed,
         "seconds": plan.seconds,
         "bound": plan.bound,
+        "past": {"tasks": list(plan.past_tasks), "uavs": list(plan.past_uavs)},
     }
 
 
@@ -96,15 +99,19 @@ def plan_from_json(data: Any, source: str) -> Plan:
                 _point(uav["start"]),
                 _point(uav["end"]),
                 float(uav["reserve_percent"]),
+                None if uav.get("full_range_m") is None else float(uav["full_range_m"]),
             )
             for uav in data["fleet"]
         ]
         number = {name: task for task, name in enumerate(tasks.ids)}
         schedule = Schedule([[number[str(name)] for name in route] for route in data["routes"]])
+        past = data.get("past") or {}
+        past_tasks, past_uavs = (tuple(str(name) for name in past.get(kind) or ()) for kind in ("tasks", "uavs"))
         solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
-    except (KeyError, TypeError, IndexError) as error:
+    except (AttributeError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
-    return make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
+    plan = make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
+    return replace(plan, past_tasks=past_tasks, past_uavs=past_uavs)
 
 
 def _point(given: Any) -> tuple[float, float] | None:

@@ -27,7 +27,7 @@ def remarks_on(plan: Plan, flight: FlightOptions | None = None) -> tuple[str, ..
     :param flight: How it is flown; without it, nothing is said about altitudes
     :return: A sentence for everything that is out of the ordinary, and at the end what no plan takes into account
     """
-    remarks = [*_of_tasks(plan), *plan.tasks.notes, *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
+    remarks = [*plan.notes, *_of_tasks(plan), *plan.tasks.notes, *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
     if flight is not None:
         remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight), *_of_return(plan, flight)]
     return (*remarks, REVIEW)

@@ -15,6 +15,7 @@ from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.leftovers import skipped_tasks
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.problem import make_instance, service_speed
+from sb3_uav.missions.readers.checks import check_fits
 from sb3_uav.missions.remarks import remarks_on
 from sb3_uav.missions.tasks import TaskList
 
@@ -61,6 +62,7 @@ def solve(
     fleet = tasks.fleet if fleet is None else fleet
     if fleet is None:
         raise ValueError(f"{tasks.source}: nothing says which UAVs there are; give a fleet.")
+    check_fits(tasks, fleet)
     instance = make_instance(tasks, fleet)
     chosen = make_solver(solver or default_spec(instance, time_limit), device="cpu")
     chosen.check(instance)

@@ -68,7 +68,8 @@ def checked(plan: Plan, flight: FlightOptions) -> Plan:
     """
     schedule = Schedule([route.stops for route in plan.routes])
     again = make_plan(plan.tasks, plan.fleet, schedule, plan.solver, plan.seed, plan.seconds)
-    again = replace(again, bound=plan.bound, time_limit=plan.time_limit)
+    kept = ("bound", "time_limit", "past_tasks", "past_uavs", "notes")
+    again = replace(again, **{name: getattr(plan, name) for name in kept})
     return replace(again, remarks=remarks_on(again, flight))
 
 
