@@ -23,6 +23,8 @@ from sb3_uav.missions.situation import Situation, situation_of
 from sb3_uav.missions.status import Status
 
 DEFAULT_SECONDS = 0.5
+# Nobody plans anything with less, in meters.
+_LEAST_RANGE = 1e-3
 # How a plan came about, from the least disruptive: the rest of the routes, or with tasks put between their stops, or
 # improved by local search, or annealed.
 Method = Literal["kept", "insertion", "repair", "search"]
@@ -98,7 +100,7 @@ def replan(plan: Plan, status: Status, time_limit: float = DEFAULT_SECONDS, seed
     if not now.is_news:
         everybody = tuple(uav.id for uav in plan.fleet)
         return Replanned(plan, len(legs), len(legs), "kept", everybody, remarks=now.remarks)
-    if not any(uav.usable_m > 0 for uav in now.fleet):
+    if max(uav.usable_m for uav in now.fleet) < _LEAST_RANGE:
         raise ValueError(f"{status.source}: no UAV has any range left beyond its reserve, so there is nothing to plan.")
     instance = make_instance(now.tasks, now.fleet)
     chosen = _least_disruptive(instance, OldRoutes(instance, now.routes), time_limit, seed, min_gain)

@@ -90,9 +90,14 @@ class _Checks:
                 continue
             if name in self._plan.past_uavs and what == "UAV":
                 raise ValueError(f"{place}: UAV {name[:40]} was lost before and is not in this plan; remove the row.")
-            near = difflib.get_close_matches(name, known, 1, 0.6)
+            spelled = {other.lower(): other for other in known}
+            near = difflib.get_close_matches(name.lower(), spelled, 1, 0.6)
             some = sorted(known)[:5]
-            guess = f"did you mean {near[0]}?" if near else f"there are {', '.join(some)}{', ...' if len(known) > 5 else ''}."
+            guess = (
+                f"did you mean {spelled[near[0]]}?"
+                if near
+                else f"there are {', '.join(some)}{', ...' if len(known) > 5 else ''}."
+            )
             raise ValueError(f"{place}: the plan has no {what} {name[:40]}; {guess}")
 
     def _report(self, report: UavReport) -> None:
