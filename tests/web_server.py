@@ -10,13 +10,12 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import uvicorn
-
-from sb3_uav.web.api import Rooms
-from sb3_uav.web.app import Settings, create_app
 from sb3_uav.web.limits import Limits
+
+if TYPE_CHECKING:
+    from sb3_uav.web.api import Rooms
 
 _PATIENCE = 120.0
 JSON = {"content-type": "application/json"}
@@ -122,6 +121,10 @@ def served(token: str | None = None, tiles: str | None = None, **limits: Any) ->
     :param tiles: As of :class:`~sb3_uav.web.app.Settings`
     :param limits: As of :class:`~sb3_uav.web.limits.Limits`
     """
+    import uvicorn
+
+    from sb3_uav.web.app import Settings, create_app
+
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         app = create_app(Settings(Limits(**limits), token, (), port, tiles))

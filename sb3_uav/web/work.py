@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.flight import FlightOptions
@@ -101,7 +101,7 @@ def _read_tasks(name: str, data: bytes, request: dict[str, Any]) -> TaskList:
 
 def _tasks_of_mission(name: str, data: bytes) -> TaskList | None:
     """Tasks and fleet of a mission that this program has written; None if it is something else."""
-    from sb3_uav.web.schemas import TasksIn, UavIn, one_sentence
+    from sb3_uav.web.schemas import TaskIn, TasksIn, UavIn, one_sentence
 
     try:
         document = json.loads(data)
@@ -111,14 +111,21 @@ def _tasks_of_mission(name: str, data: bytes) -> TaskList | None:
     if not isinstance(document, dict) or document.get("format") != "sb3-uav mission":
         return None
     try:
-        kept = ("system", "meters_per_unit", "depot", "source", "tasks")
-        tasks = TasksIn.model_validate({key: document[key] for key in kept if key in document})
-        uavs = [UavIn.model_validate(uav).model_dump() for uav in document.get("fleet") or ()]
+        # Only what is known here: plans that were changed in flight have more.
+        entries = [_known(task, TaskIn) for task in document.get("tasks") or ()]
+        tasks = TasksIn.model_validate({**_known(document, TasksIn), "tasks": entries})
+        uavs = [UavIn.model_validate(_known(uav, UavIn)).model_dump() for uav in document.get("fleet") or ()]
     except (ValidationError, TypeError) as error:
         text = one_sentence(error) if isinstance(error, ValidationError) else str(error)
         raise ValueError(f"{name}: this is no intact mission: {text}") from None
     found, fleet = problem_of({"tasks": tasks.model_dump(), "uavs": uavs})
     return replace(found, fleet=fleet if uavs else None)
+
+
+def _known(data: Any, model: type[BaseModel]) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise TypeError(f"{str(data)[:50]!r} is no object.")
+    return {key: data[key] for key in model.model_fields if key in data}
 
 
 def _tasks_to_json(tasks: TaskList) -> dict[str, Any]:
