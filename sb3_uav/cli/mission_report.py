@@ -91,7 +91,7 @@ def _table(rich: Any, plan: Plan) -> Any:
         table.add_column(heading, justify="right", no_wrap=True)
     for route in plan.routes:
         cells = [str(len(route.stops)), meters(route.length_m), meters(route.used_m), percent(route.share_of_range)]
-        cells += [f"{route.uav.reserve_percent:g} %"] if keeps_reserve else []
+        cells += [f"{route.uav.reserve_percent:.4g} %"] if keeps_reserve else []
         cells += ["-" if route.seconds is None else _time(route.seconds)] if is_timed else []
         table.add_row(rich.text.Text(shown(route.uav.id)), *cells)
     return table

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_uav.missions.labels import count, number, route_facts, shown, uav_color, uav_style
+from sb3_uav.missions.labels import count, flies, number, route_facts, shown, uav_color, uav_look
 from sb3_uav.missions.plan import Plan, Reason, Route
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
-from sb3_uav.plots.style import LINE_STYLES
 
 _WIDTH = 8.0
 # Inches of the map: between a strip and a tower.
@@ -26,6 +25,8 @@ _SKIPPED: dict[Reason, dict[str, Any]] = {
 }
 # The legend of a larger fleet would be longer than the map.
 _MAX_NAMED = 20
+# Dashes as plotly names them.
+_DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 _COLUMNS = 2
 # Points between two numbers, and from a stop to its number.
 _LABEL_WIDTH, _LABEL_HEIGHT = 11.0, 7.5
@@ -126,16 +127,20 @@ def _draw_skipped(axes: Any, plan: Plan, tasks: np.ndarray, size: float, view: t
 
 
 def _draw_route(axes: Any, plan: Plan, uav: int, route: Route, path: np.ndarray, size: float) -> None:
-    color, style = uav_color(uav), LINE_STYLES[uav_style(uav) % len(LINE_STYLES)]
+    color, look = uav_color(uav), uav_look(uav)
+    line = dict(color=color, linestyle=_DASHES[look.dash], linewidth=1.2)
+    is_hollow = look.fill != color
+    stop = dict(facecolors=look.fill, edgecolors=color, linewidths=0.9 if is_hollow else 0.0, zorder=4)
     label = f"{shown(route.uav.id)}: {route_facts(route)}"
-    if uav >= _MAX_NAMED:
-        label = f"{len(plan.routes) - _MAX_NAMED} more UAVs" if uav == _MAX_NAMED else "_nolegend_"
-    flown = path if route.length_m > 0 else path[:0]
-    axes.plot(*flown.T, color=color, linestyle=style, linewidth=1.2, zorder=3, label=label)
+    if uav == _MAX_NAMED:
+        axes.plot([], [], linestyle="", label=f"{len(plan.routes) - _MAX_NAMED} more UAVs")
+    elif uav < _MAX_NAMED:
+        axes.plot([], [], **line, marker="o", markersize=4, markerfacecolor=look.fill, label=label)
+    axes.plot(*(path if flies(route) else path[:0]).T, **line, zorder=3)
     must = plan.tasks.must[list(route.stops)]
     stops = path[1:-1]
-    axes.scatter(*stops[~must].T, s=size, color=color, zorder=4, linewidths=0)
-    axes.scatter(*stops[must].T, s=4 * size, color=color, marker="*", zorder=4, linewidths=0)
+    axes.scatter(*stops[~must].T, s=size, **stop)
+    axes.scatter(*stops[must].T, s=4 * size, marker="*", **stop)
     for marker, own, point in ((">", route.uav.start, path[0]), ("X", route.uav.end, path[-1])):
         if own is not None:
             axes.scatter(*point, marker=marker, s=50, color=color, edgecolors="black", linewidths=0.8, zorder=6)
