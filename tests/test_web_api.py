@@ -184,7 +184,11 @@ def test_wrong_input_gets_one_sentence(server: Served, body, sentence):
         ("a.xlsx", b"PK", "save the sheet as CSV"),
         ("../../etc/passwd", b"x", "passwd"),
         ("a.json", b"[" * 100_000, "a.json"),
-        ("a.json", b'{"format": "sb3-uav mission", "tasks": 3, "system": "plane"}', "this is no intact mission: 'int' object is not iterable"),
+        (
+            "a.json",
+            b'{"format": "sb3-uav mission", "tasks": 3, "system": "plane"}',
+            "this is no intact mission: 'int' object is not iterable",
+        ),
         ("a.csv", b"id,x,y\n" + b"".join(b"%d,%d,%d\n" % (i, i, i * i) for i in range(51)), "there are 51 tasks"),
     ],
 )

@@ -198,6 +198,7 @@ function fleet() {
 
 async function solve() {
   refuse(null);
+  $("state").dataset.state = "sent";
   try {
     const options = { time_limit: field("time", "The time"), seed: field("seed", "The seed"), allow_duplicates: $("duplicates").checked };
     state.progress = await ask("POST", "/api/v1/solves", { tasks: state.tasks, fleet: fleet(), options });
