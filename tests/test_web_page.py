@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import http.server
 import re
+import threading
 import zipfile
 from collections.abc import Iterator
 from typing import Any
@@ -69,6 +71,7 @@ def click_task(page: Any, task: str) -> None:
     click_map(page, *place)
 
 
+@pytest.mark.slow
 def test_from_a_file_to_a_zip(server: Served, browser: Any, tmp_path):
     with visit_in(browser) as visit:
         page = opened(visit, server)
@@ -135,6 +138,7 @@ def test_by_clicks_on_the_map(server: Served, browser: Any):
         assert page.locator("#tasks-summary").inner_text().startswith("2 tasks")
 
 
+@pytest.mark.slow
 def test_a_second_browser_waits_in_the_queue(server: Served, browser: Any):
     with visit_in(browser) as first, visit_in(browser) as second:
         for visit in (first, second):
@@ -200,6 +204,44 @@ def test_the_login_form(browser: Any):
         page.fill("#token", "a-token-of-these-tests")
         page.click("button")
         page.wait_for_selector("body[data-ready]")
+
+
+def test_tiles_come_from_their_server_alone(browser: Any):
+    asked: list[str] = []
+
+    class Tiles(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            self.send_response(200)
+            self.send_header("content-type", "image/svg+xml")
+            self.end_headers()
+            self.wfile.write(
+                b'<svg xmlns="http://www.w3.org/2000/svg" width="256" height="256"><rect width="256" height="256"/></svg>'
+            )
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Tiles) as tiles:
+        threading.Thread(target=tiles.serve_forever).start()
+        try:
+            with served(tiles=f"http://127.0.0.1:{tiles.server_port}/{{z}}/{{x}}/{{y}}.svg") as server:
+                with visit_in(browser) as visit:
+                    page = opened(visit, server)
+                    page.locator("#attribution", has_text="Map tiles: 127.0.0.1").wait_for()
+                    drop(page, "field.csv", FIELD)
+                    page.get_by_text("24 tasks").wait_for()
+                    # A canvas with pictures from elsewhere can no longer be read: they have been drawn.
+                    page.wait_for_timeout(500)
+                    read = "document.getElementById('map').getContext('2d').getImageData(3, 3, 1, 1)"
+                    with pytest.raises(Exception, match="tainted by cross-origin data"):
+                        page.evaluate(read)
+        finally:
+            tiles.shutdown()
+    levels = {int(path.split("/")[1]) for path in asked}
+    assert 0 <= min(levels) <= 3 and 12 <= max(levels) <= 19
+    # Tile 8 degrees east and 47 degrees north of level 13, see https://wiki.openstreetmap.org/wiki/Slippy_map_tilenames.
+    assert any(path.startswith(f"/{level}/{int((8 + 180) / 360 * 2**level)}/") for path in asked for level in levels)
 
 
 def test_a_narrow_window_shows_everything(server: Served, browser: Any):

@@ -13,6 +13,7 @@ import ipaddress
 import json
 import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
+from contextlib import suppress
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,6 +28,7 @@ _SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 _OPEN_PATHS = ("/login", "/static/")
 _SECONDS_PER_BLOCK = 20.0
 _SECONDS_PER_BODY = 120.0
+_SECONDS_OF_LINGERING = 5.0
 
 
 class Keys:
@@ -163,7 +165,7 @@ class Guard:
         """Read a body of limited size, and pass it on."""
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length[:20]) > self._max_body_bytes:
-            await _answer(send, *self._too_large())
+            await self._refuse_body(receive, send)
             return
         try:
             await asyncio.wait_for(self._bodies.acquire(), _SECONDS_PER_BLOCK)
@@ -173,7 +175,7 @@ class Guard:
         try:
             body = await asyncio.wait_for(self._read(receive), _SECONDS_PER_BODY)
             if body is None:
-                await _answer(send, *self._too_large())
+                await self._refuse_body(receive, send)
                 return
             messages = [{"type": "http.request", "body": body, "more_body": False}]
             del body
@@ -202,12 +204,27 @@ class Guard:
             if not message.get("more_body", False):
                 return bytes(body)
 
-    def _too_large(self) -> tuple[int, str, list[tuple[bytes, bytes]]]:
-        return 413, f"A request may have {self._max_body_bytes / 2**20:g} MiB at most.", _CLOSE
+    async def _refuse_body(self, receive: Receive, send: SendFunction) -> None:
+        """
+        Say that a body is too large, and throw away what still comes in for a moment: a connection that is closed while a
+        client sends is reset, and then the client never sees the sentence.
+        """
+        sentence = f"A request may have {self._max_body_bytes / 2**20:g} MiB at most."
+        await _answer(send, 413, sentence, _CLOSE, is_last=False)
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(_drain(receive), _SECONDS_OF_LINGERING)
+        await send({"type": "http.response.body", "body": b""})
 
 
 class _GoneError(Exception):
     """The client has closed the connection."""
+
+
+async def _drain(receive: Receive) -> None:
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect" or not message.get("more_body", False):
+            return
 
 
 # Else the server would read the rest of the body to get to the next request.
@@ -222,8 +239,10 @@ def _is_same_origin(headers: dict[str, str], host: str) -> bool:
     return headers.get("sec-fetch-site", "none") in ("same-origin", "none")
 
 
-async def _answer(send: SendFunction, status: int, sentence: str, headers: list[tuple[bytes, bytes]]) -> None:
+async def _answer(
+    send: SendFunction, status: int, sentence: str, headers: list[tuple[bytes, bytes]], is_last: bool = True
+) -> None:
     body = json.dumps({"detail": sentence}).encode()
     about = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": [*about, *headers]})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": "http.response.body", "body": body, "more_body": not is_last})
