@@ -119,6 +119,7 @@ def test_cancel_keeps_the_plan_and_the_queue_moves_on(server: Served):
 
 
 def kill_the_solver(server: Served):
+    assert server.rooms is not None
     (worker,) = server.rooms.solves.workers
     assert worker is not None
     os.kill(worker.process.pid, signal.SIGKILL)
@@ -215,7 +216,7 @@ def test_a_solver_that_refuses_is_quoted(server: Served):
 
 
 def test_bodies_are_measured_while_they_come_in(server: Served):
-    sent = []
+    sent: list[int] = []
 
     def blocks():
         while len(sent) < 200:

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -103,14 +108,12 @@ def test_oldest_sessions_are_dropped():
     from sb3_uav.web.sessions import Sessions
 
     sessions = Sessions(2)
-    names = [sessions.open("") for _ in range(2)]
-    sessions.save(names[0], b"old")
-    assert sessions.open(names[0]) == names[0]
-    third = sessions.open("")
-    assert len(sessions) == 2
-    assert sessions.load(names[0]) == b"old"
-    # The one that was not used for longest; its id is not taken over.
-    assert sessions.open(names[1]) not in (*names, third)
+    old, other = sessions.save("", b"old"), sessions.save("", b"other")
+    assert sessions.save(old, b"new") == old
+    # The one that was not used for longest goes; its id is not taken over by whoever shows it.
+    sessions.save("", b"third")
+    assert (sessions.load(old), sessions.load(other)) == (b"new", None)
+    assert sessions.save(other, b"x") != other
 
 
 JUNK = st.recursive(
@@ -184,6 +187,43 @@ def test_another_address_needs_a_token(capsys):
     # It becomes a part of a header.
     with pytest.raises(ValueError, match="tiles is"):
         _checked_tiles("https://x; script-src */{z}/{x}/{y}")
+
+
+def test_without_the_extra(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    assert main(["serve", "--port", "0"]) == 2
+    assert "[web]" in capsys.readouterr().err
+
+
+def family(pid: int) -> list[int]:
+    children = [int(child) for file in Path(f"/proc/{pid}/task").glob("*/children") for child in file.read_text().split()]
+    return [pid, *(member for child in children for member in family(child))]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc")
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_no_process_is_left_behind(end):
+    command = [sys.executable, "-m", "sb3_uav", "serve", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            port = int(process.stdout.readline().partition("//127.0.0.1:")[2].partition(" ")[0])
+            server = Served(None, port)
+            name = server.solve(time_limit=60)
+            server.wait(name, "running", with_plan=True)
+            members = family(process.pid)
+            assert len(members) >= 4
+        finally:
+            process.send_signal(end)
+        assert process.wait(30) == (130 if end == signal.SIGINT else -9)
+        assert process.stderr is not None
+        if end == signal.SIGINT:
+            assert process.stderr.read().splitlines()[-1:] == ["sb3-uav serve: interrupted"]
+    until = time.monotonic() + 20
+    while left := [pid for pid in members if Path(f"/proc/{pid}").exists()]:
+        assert time.monotonic() < until, left
+        time.sleep(0.05)
 
 
 def test_a_port_in_use_is_one_line(server: Served, capsys):

@@ -257,6 +257,9 @@ def test_a_narrow_window_shows_everything(server: Served, browser: Any):
 def test_a_draft_of_the_api_opens_in_the_page(server: Served, browser: Any):
     with visit_in(browser) as visit:
         page = opened(visit, server)
+        page.get_by_text("Load an example").click()
+        page.get_by_text("80 tasks").wait_for()
+        page.wait_for_load_state("networkidle")
         cookies = "; ".join(f"{cookie['name']}={cookie['value']}" for cookie in visit.context.cookies())
         draft = {"tasks": problem()["tasks"], "form": {"count": "5"}}
         assert server.ask("PUT", "/session", draft, {"cookie": cookies}).status == 200

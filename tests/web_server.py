@@ -38,11 +38,11 @@ class Answer(NamedTuple):
 
 class Served:
     """
-    :ivar rooms: The pools of the server
+    :ivar rooms: The pools of the server; None if it is another process
     :ivar port: Its port
     """
 
-    def __init__(self, rooms: Rooms, port: int) -> None:
+    def __init__(self, rooms: Rooms | None, port: int) -> None:
         self.rooms, self.port = rooms, port
 
     @property

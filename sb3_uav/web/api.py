@@ -60,7 +60,7 @@ class Rooms:
         self.limits, self.tiles = limits, tiles
         self.solves = Pool(limits.max_solves, limits.max_waiting, limits.max_kept, "solves")
         # Files are read and written apart from solves, so that neither waits for the other.
-        self.desk = Pool(1, 32, 1, "files")
+        self.desk = Pool(1, 16, 1, "files")
 
     def open(self) -> None:
         """Start the processes."""
@@ -78,7 +78,8 @@ class Rooms:
             id=job.id,
             state=job.state,
             place=self.solves.place(job),
-            error=job.error,
+            # What keeps the workers from starting, where that is why it waits.
+            error=self.solves.start_error if job.state == "waiting" else job.error,
             version=job.version,
             elapsed_s=round(job.elapsed, 2),
             time_limit=job.about["time_limit"],

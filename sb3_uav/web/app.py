@@ -142,24 +142,19 @@ def _add_page(app: FastAPI, keys: Keys, sessions: Sessions) -> None:
         response.set_cookie(keys.login_cookie, keys.login_value, httponly=True, samesite="strict")
         return {"ok": True}
 
-    def session_of(request: Request, response: Response) -> str:
-        given = cookie_of({"cookie": request.headers.get("cookie", "")}, keys.session_cookie)
-        name = sessions.open(given)
-        if name != given:
-            response.set_cookie(keys.session_cookie, name, httponly=True, samesite="strict", max_age=30 * 86_400)
-        return name
+    def session_of(request: Request) -> str:
+        return cookie_of({"cookie": request.headers.get("cookie", "")}, keys.session_cookie)
 
     @app.get("/session", include_in_schema=False)
     def load(request: Request) -> Response:
-        response = Response(media_type="application/json")
-        draft = sessions.load(session_of(request, response)) or b"null"
-        response.body = draft
-        response.headers["content-length"] = str(len(draft))
-        return response
+        return Response(sessions.load(session_of(request)) or b"null", media_type="application/json")
 
     @app.put("/session", include_in_schema=False)
     def save(draft: Draft, request: Request, response: Response) -> dict[str, bool]:
-        sessions.save(session_of(request, response), draft.model_dump_json().encode())
+        given = session_of(request)
+        name = sessions.save(given, draft.model_dump_json().encode())
+        if name != given:
+            response.set_cookie(keys.session_cookie, name, httponly=True, samesite="strict", max_age=30 * 86_400)
         return {"ok": True}
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

@@ -86,6 +86,7 @@ class Pool:
         self.workers: list[Worker | None] = [None] * size
         self._ready = [False] * size
         self.start_error: str | None = None
+        self._pause = 1.0
         self._threads = [threading.Thread(target=self._serve, args=(slot,), daemon=True) for slot in range(size)]
 
     def open(self) -> None:
@@ -192,7 +193,7 @@ class Pool:
             worker = self.workers[slot] = Worker()
         except OSError as error:
             self.start_error = f"A worker cannot be started ({error})."
-            time.sleep(1.0)
+            self._wait_longer()
             return None
         while not self._closed:
             ready = wait(worker.waitable, _TICK)
@@ -202,15 +203,21 @@ class Pool:
                 except (EOFError, OSError):
                     break
                 self._ready[slot] = True
-                self.start_error = None
+                self.start_error, self._pause = None, 1.0
                 return worker
             if ready:
                 break
         if not self._closed:
             self.start_error = "A worker ended while it was started; see the output of the server."
-            time.sleep(1.0)
+            self._wait_longer()
         self._stop(slot, worker)
         return None
+
+    def _wait_longer(self) -> None:
+        """What cannot be started now may never be; do not try it all the time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed, self._pause)
+        self._pause = min(2 * self._pause, 60.0)
 
     def _stop(self, slot: int, worker: Worker) -> None:
         self._ready[slot] = False

@@ -172,7 +172,7 @@ class Progress(BaseModel):
     id: str
     state: Literal["waiting", "running", "done", "failed", "canceled"]
     place: int | None = Field(description="Solves before this one in the queue; null when it does not wait")
-    error: str | None = Field(description="One sentence, when it failed")
+    error: str | None = Field(description="One sentence, when it failed or cannot start")
     version: int = Field(description="Grows with every change")
     elapsed_s: float
     time_limit: float

@@ -23,33 +23,29 @@ class Sessions:
     def __len__(self) -> int:
         return len(self._drafts)
 
-    def open(self, name: str) -> str:
+    def load(self, name: str) -> bytes | None:
         """
         :param name: Id that the browser has sent, possibly empty
-        :return: The same if it is known, a new one otherwise
+        :return: Its draft as JSON; None if there is none
         """
-        with self._lock:
-            if name in self._drafts:
-                self._drafts.move_to_end(name)
-                return name
-            name = secrets.token_urlsafe(24)
-            self._drafts[name] = b""
-            while len(self._drafts) > self._most:
-                self._drafts.popitem(last=False)
-            return name
-
-    def load(self, name: str) -> bytes | None:
-        """:return: The draft of a session as JSON; None if there is none yet"""
         with self._lock:
             packed = self._drafts.get(name)
-        return zlib.decompress(packed) if packed else None
+            if packed is not None:
+                self._drafts.move_to_end(name)
+        return None if packed is None else zlib.decompress(packed)
 
-    def save(self, name: str, draft: bytes) -> None:
+    def save(self, name: str, draft: bytes) -> str:
         """
-        :param name: An open session
+        :param name: Id that the browser has sent, possibly empty
         :param draft: JSON
+        :return: The same id if it is known, a new one otherwise: nobody can choose the id of somebody else
         """
         packed = zlib.compress(draft, 1)
         with self._lock:
-            if name in self._drafts:
-                self._drafts[name] = packed
+            if name not in self._drafts:
+                name = secrets.token_urlsafe(24)
+            self._drafts[name] = packed
+            self._drafts.move_to_end(name)
+            while len(self._drafts) > self._most:
+                self._drafts.popitem(last=False)
+        return name

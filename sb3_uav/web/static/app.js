@@ -1,34 +1,78 @@
 // The page: what the user has entered (the draft, kept by the server), and the plans that come back.
 // Everything of the user is put into the page as text, never as HTML.
-import { MissionMap, styleOf } from "./map.js";
+import { exampleTasks, field, fleet } from "./forms.js";
+import { MissionMap } from "./map.js";
 import { showDetails, uavRows } from "./panels.js";
-import { $, ask, element, kilometers, refuse, minutes, number } from "./tools.js";
+import { showProgress } from "./progress.js";
+import { showResult } from "./results.js";
+import { Tiles } from "./tiles.js";
+import { $, ask, element, refuse } from "./tools.js";
 
-const FIELDS = ["count", "range", "range-unit", "speed", "reserve", "time", "seed", "altitude", "altitude-step", "firmware", "vehicle", "landing"];
+const FIELDS = [
+  "count",
+  "range",
+  "range-unit",
+  "speed",
+  "reserve",
+  "time",
+  "seed",
+  "altitude",
+  "altitude-step",
+  "firmware",
+  "vehicle",
+  "landing",
+];
 const POLL_MS = 250;
 
 const emptyTasks = () => ({ system: $("system").value, meters_per_unit: 1, depot: null, source: "drawn by hand", tasks: [] });
-const state = { tasks: emptyTasks(), uavs: null, solve: null, stale: false, progress: null, report: null, selected: null, mode: null, limits: null };
+const state = {
+  tasks: emptyTasks(),
+  uavs: null,
+  solve: null,
+  stale: false,
+  progress: null,
+  report: null,
+  selected: null,
+  mode: null,
+  limits: null,
+};
 const map = new MissionMap($("map"), clicked);
 $("map").mission = map;
 
 // The draft on the server.
-let saving = false, again = false;
+let saving = false,
+  again = false;
 async function save() {
-  if (saving) { again = true; return; }
+  if (saving) {
+    again = true;
+    return;
+  }
   saving = true;
   try {
     const form = Object.fromEntries(FIELDS.map((name) => [name, $(name).value]));
-    await ask("PUT", "/session", { tasks: state.tasks, uavs: state.uavs, solve: state.solve, form: { ...form, stale: state.stale, duplicates: $("duplicates").checked } });
-  } catch (error) { refuse(error); }
+    await ask("PUT", "/session", {
+      tasks: state.tasks,
+      uavs: state.uavs,
+      solve: state.solve,
+      form: { ...form, stale: state.stale, duplicates: $("duplicates").checked },
+    });
+  } catch (error) {
+    refuse(error);
+  }
   saving = false;
-  if (again) { again = false; save(); }
+  if (again) {
+    again = false;
+    save();
+  }
 }
 
 async function load() {
   state.limits = await ask("GET", "/api/v1/limits");
-  map.tiles = state.limits.tiles;
-  if (map.tiles) { $("attribution").hidden = false; $("attribution").textContent = `Map tiles: ${new URL(map.tiles.replace("{s}", "a")).host}`; }
+  if (state.limits.tiles) map.tiles = new Tiles(state.limits.tiles, () => map.draw());
+  if (map.tiles) {
+    $("attribution").hidden = false;
+    $("attribution").textContent = `Map tiles: ${new URL(state.limits.tiles.replace("{s}", "a")).host}`;
+  }
   const draft = await ask("GET", "/session");
   if (draft) {
     Object.assign(state, { tasks: draft.tasks, uavs: draft.uavs, solve: draft.solve, stale: draft.form.stale === true });
@@ -54,11 +98,29 @@ function changed() {
 }
 
 function show() {
-  const { tasks } = state, list = tasks.tasks, must = list.filter((task) => task.must).length, forbidden = list.filter((task) => task.forbidden).length;
-  const system = tasks.system === "wgs84" ? "latitude, longitude" : tasks.meters_per_unit === 1 ? "x, y in meters" : `x, y in units of ${tasks.meters_per_unit} m`;
-  $("tasks-summary").textContent = list.length || tasks.depot
-    ? [`${list.length} tasks`, must && `${must} must be served`, forbidden && `${forbidden} forbidden`, tasks.depot ? "" : "no depot yet", system, tasks.source].filter(Boolean).join(" · ")
-    : "No tasks yet.";
+  const { tasks } = state,
+    list = tasks.tasks,
+    must = list.filter((task) => task.must).length,
+    forbidden = list.filter((task) => task.forbidden).length;
+  const system =
+    tasks.system === "wgs84"
+      ? "latitude, longitude"
+      : tasks.meters_per_unit === 1
+        ? "x, y in meters"
+        : `x, y in units of ${tasks.meters_per_unit} m`;
+  $("tasks-summary").textContent =
+    list.length || tasks.depot
+      ? [
+          `${list.length} tasks`,
+          must && `${must} must be served`,
+          forbidden && `${forbidden} forbidden`,
+          tasks.depot ? "" : "no depot yet",
+          system,
+          tasks.source,
+        ]
+          .filter(Boolean)
+          .join(" · ")
+      : "No tasks yet.";
   $("system-label").hidden = list.length > 0 || tasks.depot !== null;
   $("example").hidden = list.length > 0;
   $("clear").hidden = !list.length && !tasks.depot;
@@ -67,11 +129,13 @@ function show() {
   $("split").textContent = state.uavs ? "Use equal UAVs" : "Set each UAV by itself";
   uavRows($("uavs"), state.uavs ?? [], changed);
   const waits = state.progress && ["waiting", "running"].includes(state.progress.state);
-  $("solve").hidden = waits; $("cancel").hidden = !waits; $("solve").disabled = !list.length;
+  $("solve").hidden = waits;
+  $("cancel").hidden = !waits;
+  $("solve").disabled = !list.length;
   $("solve").textContent = state.report ? "Plan again" : "Plan the mission";
   $("stale").hidden = !state.stale;
   showMap();
-  showResult();
+  showResult(state, select, showTask);
 }
 
 function showMap() {
@@ -79,72 +143,79 @@ function showMap() {
   map.selected = state.selected;
   map.pointing = state.mode !== null;
   $("map").classList.toggle("pointing", map.pointing);
-  map.show({ system: tasks.system, metersPerUnit: tasks.meters_per_unit, tasks: tasks.tasks, depot: tasks.depot, routes: state.report?.routes ?? [] });
-  const hints = { add: "Click on the map to add tasks. Escape ends it.", depot: "Click where the UAVs start and land.", move: "Click the new place of the task." };
+  map.show({
+    system: tasks.system,
+    metersPerUnit: tasks.meters_per_unit,
+    tasks: tasks.tasks,
+    depot: tasks.depot,
+    routes: state.report?.routes ?? [],
+  });
+  const hints = {
+    add: "Click on the map to add tasks. Escape ends it.",
+    depot: "Click where the UAVs start and land.",
+    move: "Click the new place of the task.",
+  };
   const empty = !tasks.tasks.length && !tasks.depot && state.mode === null;
   $("hint").hidden = !state.mode && !empty;
   $("hint").textContent = state.mode ? hints[state.mode] : "Drop a file of tasks anywhere, or add tasks by click.";
-  $("add").setAttribute("aria-pressed", state.mode === "add"); $("depot").setAttribute("aria-pressed", state.mode === "depot");
+  $("add").setAttribute("aria-pressed", state.mode === "add");
+  $("depot").setAttribute("aria-pressed", state.mode === "depot");
   showDetails($("details"), state, { changed, select, setMode, forbid, remove });
 }
 
-function showResult() {
-  const { report } = state;
-  $("result").hidden = report === null;
-  if (!report) return;
-  const pairs = [
-    ["Value", `${number(report.objective)} of ${number(report.total_value)}`],
-    ...(report.bound !== null ? [["Proven bound", number(report.bound)], ["Gap", `${(report.gap * 100).toFixed(1)} %`]] : []),
-    ["Tasks served", `${report.n_served} of ${report.n_tasks}`], ["Length", kilometers(report.length_m)],
-    ...(report.unserved.length ? [["Must be served, but is not", report.unserved.join(", ")]] : []),
-  ];
-  $("figures").replaceChildren(...pairs.flatMap(([name, value]) => [element("dt", name), element("dd", value)]));
-  $("routes").replaceChildren(...report.routes.map((route, index) => {
-    const button = element("button"), share = Math.round(route.share_of_range * 100);
-    const swatch = element("canvas", "", "swatch"); swatch.width = swatch.height = 12;
-    const pen = swatch.getContext("2d"); pen.fillStyle = styleOf(index).color; pen.fillRect(0, 0, 12, 12);
-    const meter = element("meter", "", "share"); meter.max = 1; meter.value = route.share_of_range;
-    button.append(swatch, element("span", route.uav, "name"), element("span", route.stops.length ? `${route.stops.length} stops · ${kilometers(route.length_m)} · ${share} %` : "stays on the ground", "meta"), meter);
-    button.type = "button"; button.dataset.route = index;
-    button.title = `${route.uav}: ${share} % of its range${route.seconds === null ? "" : `, ${minutes(route.seconds)}`}`;
-    button.setAttribute("aria-pressed", state.selected?.route === index);
-    button.addEventListener("click", () => select(state.selected?.route === index ? null : { route: index }));
-    return wrapped(button);
-  }));
-  $("skipped-box").hidden = !report.skipped.length;
-  $("skipped-box").firstElementChild.textContent = `Skipped tasks: ${report.skipped.length}`;
-  $("skipped").replaceChildren(...report.skipped.map((one) => {
-    const button = element("button", `${one.id} `);
-    button.type = "button"; button.append(element("small", one.text)); button.dataset.task = one.id;
-    button.addEventListener("click", () => { const task = taskOf(one.id); if (task) { select({ task: one.id }); map.center(task.point); } });
-    return wrapped(button);
-  }));
-  $("remarks").replaceChildren(...report.remarks.map((sentence) => element("li", sentence)));
-  const flight = new URLSearchParams({ altitude_m: $("altitude").value, altitude_step_m: $("altitude-step").value, firmware: $("firmware").value, vehicle: $("vehicle").value, landing: $("landing").value });
-  $("download").href = `/api/v1/solves/${encodeURIComponent(state.solve)}/download?${flight}`;
+function showTask(id) {
+  const task = taskOf(id);
+  if (!task) return;
+  select({ task: id });
+  map.center(task.point);
 }
-
-const wrapped = (child) => { const item = element("li"); item.append(child); return item; };
 const taskOf = (id) => state.tasks.tasks.find((task) => task.id === id);
 
-function select(what) { state.selected = what; showMap(); showResult(); }
-function setMode(mode) { state.mode = state.mode === mode ? null : mode; showMap(); }
-function forbid(task) { task.forbidden = !task.forbidden; changed(); }
-function remove(task) { state.tasks.tasks.splice(state.tasks.tasks.indexOf(task), 1); state.selected = null; changed(); }
+function select(what) {
+  state.selected = what;
+  showMap();
+  showResult(state, select, showTask);
+}
+function setMode(mode) {
+  state.mode = state.mode === mode ? null : mode;
+  showMap();
+}
+function forbid(task) {
+  task.forbidden = !task.forbidden;
+  changed();
+}
+function remove(task) {
+  state.tasks.tasks.splice(state.tasks.tasks.indexOf(task), 1);
+  state.selected = null;
+  changed();
+}
 
 function clicked(point, under) {
   const rounded = point.map((value) => Number(value.toFixed(state.tasks.system === "wgs84" ? 7 : 3)));
   const isEarth = state.tasks.system !== "wgs84" || (Math.abs(point[0]) <= 90 && Math.abs(point[1]) <= 180);
   if (state.mode === "move" && state.selected?.task && isEarth) {
-    taskOf(state.selected.task).point = rounded; state.mode = null; changed();
+    taskOf(state.selected.task).point = rounded;
+    state.mode = null;
+    changed();
   } else if (state.mode === "depot" && isEarth) {
-    state.tasks.depot = rounded; state.mode = null; changed();
+    state.tasks.depot = rounded;
+    state.mode = null;
+    changed();
   } else if (state.mode === "add" && isEarth) {
-    if (state.limits && state.tasks.tasks.length >= state.limits.max_tasks) return refuse(new Error(`This server admits ${state.limits.max_tasks} tasks.`));
+    if (state.limits && state.tasks.tasks.length >= state.limits.max_tasks)
+      return refuse(new Error(`This server admits ${state.limits.max_tasks} tasks.`));
     let count = state.tasks.tasks.length + 1;
     const taken = new Set(state.tasks.tasks.map((task) => task.id));
     while (taken.has(`t${count}`)) count++;
-    state.tasks.tasks.push({ id: `t${count}`, point: rounded, value: 1, service_s: 0, must: false, altitude_m: null, forbidden: false });
+    state.tasks.tasks.push({
+      id: `t${count}`,
+      point: rounded,
+      value: 1,
+      service_s: 0,
+      must: false,
+      altitude_m: null,
+      forbidden: false,
+    });
     changed();
   } else select(under);
 }
@@ -152,18 +223,40 @@ function clicked(point, under) {
 async function takeFile(file) {
   if (!file) return;
   refuse(null);
-  if (state.limits && file.size > state.limits.max_body_mb * 2 ** 20) return refuse(new Error(`${file.name} has ${(file.size / 2 ** 20).toFixed(0)} MiB; this server admits ${state.limits.max_body_mb}.`));
+  if (state.limits && file.size > state.limits.max_body_mb * 2 ** 20)
+    return refuse(
+      new Error(`${file.name} has ${(file.size / 2 ** 20).toFixed(0)} MiB; this server admits ${state.limits.max_body_mb}.`),
+    );
   $("tasks-summary").textContent = `Reading ${file.name} …`;
   try {
-    const { uavs, notes, ...tasks } = await ask("POST", `/api/v1/tasks?name=${encodeURIComponent(file.name)}&allow_duplicates=${$("duplicates").checked}`, file);
-    tasks.tasks.forEach((task) => { task.forbidden = false; });
-    Object.assign(state, { tasks, uavs: uavs ?? state.uavs, report: null, solve: null, progress: null, selected: null, mode: null, stale: false });
+    const { uavs, notes, ...tasks } = await ask(
+      "POST",
+      `/api/v1/tasks?name=${encodeURIComponent(file.name)}&allow_duplicates=${$("duplicates").checked}`,
+      file,
+    );
+    tasks.tasks.forEach((task) => {
+      task.forbidden = false;
+    });
+    Object.assign(state, {
+      tasks,
+      uavs: uavs ?? state.uavs,
+      report: null,
+      solve: null,
+      progress: null,
+      selected: null,
+      mode: null,
+      stale: false,
+    });
     $("system").value = tasks.system;
-    $("state").textContent = ""; $("progress").hidden = true;
+    $("state").textContent = "";
+    $("progress").hidden = true;
     changed();
     map.fit();
     if (notes.length) refuse(new Error(notes.join(" ")));
-  } catch (error) { refuse(error); show(); }
+  } catch (error) {
+    refuse(error);
+    show();
+  }
 }
 
 async function takeFleet(file) {
@@ -171,42 +264,35 @@ async function takeFleet(file) {
   refuse(null);
   try {
     const { uavs, system } = await ask("POST", `/api/v1/fleets?name=${encodeURIComponent(file.name)}`, file);
-    if (system && system !== state.tasks.system && uavs.some((uav) => uav.start || uav.end)) throw new Error(`${file.name}: the starts and ends of these UAVs have other coordinates than the tasks.`);
+    if (system && system !== state.tasks.system && uavs.some((uav) => uav.start || uav.end))
+      throw new Error(`${file.name}: the starts and ends of these UAVs have other coordinates than the tasks.`);
     state.uavs = uavs;
     changed();
-  } catch (error) { refuse(error); }
-}
-
-// What the form says, with sentences instead of numbers that are none.
-function field(name, what, isOptional = false) {
-  const input = $(name), value = input.valueAsNumber;
-  if (Number.isNaN(value)) {
-    if (isOptional && !input.validity.badInput) return null;
-    input.focus();
-    throw new Error(`${what} is missing.`);
+  } catch (error) {
+    refuse(error);
   }
-  return value;
-}
-
-function fleet() {
-  if (state.uavs) return { uavs: state.uavs };
-  return {
-    count: field("count", "The number of UAVs"), range_m: field("range", "The range") * ($("range-unit").value === "km" ? 1000 : 1),
-    speed_mps: field("speed", "The speed", true), reserve_percent: field("reserve", "The reserve"),
-  };
 }
 
 async function solve() {
   refuse(null);
   $("state").dataset.state = "sent";
   try {
-    const options = { time_limit: field("time", "The time"), seed: field("seed", "The seed"), allow_duplicates: $("duplicates").checked };
-    state.progress = await ask("POST", "/api/v1/solves", { tasks: state.tasks, fleet: fleet(), options });
-    state.solve = state.progress.id; state.stale = false; state.selected = null; state.mode = null;
+    const options = {
+      time_limit: field("time", "The time"),
+      seed: field("seed", "The seed"),
+      allow_duplicates: $("duplicates").checked,
+    };
+    state.progress = await ask("POST", "/api/v1/solves", { tasks: state.tasks, fleet: fleet(state.uavs), options });
+    state.solve = state.progress.id;
+    state.stale = false;
+    state.selected = null;
+    state.mode = null;
     show();
     save();
     follow();
-  } catch (error) { refuse(error); }
+  } catch (error) {
+    refuse(error);
+  }
 }
 
 // Ask for news until the solve is over. A newer solve ends an older loop.
@@ -218,7 +304,7 @@ async function follow() {
       const progress = await ask("GET", `/api/v1/solves/${encodeURIComponent(name)}`);
       if (state.solve !== name) return;
       state.progress = progress;
-      showProgress();
+      showProgress(state.progress);
       if (progress.version !== seen && progress.has_plan) {
         const { report } = await ask("GET", `/api/v1/solves/${encodeURIComponent(name)}/plan`);
         if (state.solve !== name) return;
@@ -228,8 +314,15 @@ async function follow() {
       seen = progress.version;
       if (!["waiting", "running"].includes(progress.state)) return;
     } catch (error) {
-      if (error.status === 404) { Object.assign(state, { solve: null, progress: null, report: null }); show(); return; }
-      if (error.status) { refuse(error); return; }
+      if (error.status === 404) {
+        Object.assign(state, { solve: null, progress: null, report: null });
+        show();
+        return;
+      }
+      if (error.status) {
+        refuse(error);
+        return;
+      }
       $("state").textContent = "The server does not answer; trying again …";
       await pause(2000);
     }
@@ -239,57 +332,43 @@ async function follow() {
 
 const pause = (time) => new Promise((done) => setTimeout(done, time));
 
-function showProgress() {
-  const { progress } = state, isRunning = progress.state === "running";
-  const sentences = {
-    waiting: progress.place ? `${progress.place} ${progress.place === 1 ? "solve" : "solves"} before this one in the queue.` : progress.ready ? "Starts as soon as a solver is free (next in the queue)." : "The solver is being started; the first time takes up to a minute.",
-    running: progress.has_plan ? `Value ${number(progress.objective)} after ${progress.elapsed_s.toFixed(1)} s; getting better …` : "Looking for a first plan …",
-    done: `Done in ${progress.elapsed_s.toFixed(1)} s.`, failed: "No plan.", canceled: progress.has_plan ? "Stopped; the best plan so far is shown." : "Stopped before there was a plan.",
-  };
-  $("state").textContent = sentences[progress.state];
-  $("state").dataset.state = progress.state;
-  if (progress.state === "failed") refuse(new Error(progress.error));
-  $("progress").hidden = !(isRunning || progress.history.length > 1);
-  $("progress").querySelector("i").style.width = `${Math.min(100, progress.state === "done" ? 100 : 100 * progress.elapsed_s / progress.time_limit)}%`;
-  drawCurve(progress);
-}
-
-function drawCurve({ history, time_limit, elapsed_s }) {
-  const canvas = $("curve"), pen = canvas.getContext("2d"), { width, height } = canvas;
-  pen.clearRect(0, 0, width, height);
-  if (!history.length) return;
-  const low = history[0][1], high = Math.max(history.at(-1)[1], low + 1e-9), end = Math.max(time_limit, elapsed_s);
-  const place = ([seconds, value]) => [seconds / end * (width - 4) + 2, height - 6 - (value - low) / (high - low) * (height - 12)];
-  pen.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--accent"); pen.lineWidth = 2;
-  pen.beginPath();
-  let y = place(history[0])[1];
-  pen.moveTo(place(history[0])[0], y);
-  for (const [px, py] of history.map(place)) { pen.lineTo(px, y); pen.lineTo(px, py); y = py; }
-  pen.lineTo(place([elapsed_s, high])[0], y);
-  pen.stroke();
-}
-
 function example() {
-  let seed = 7;
-  const random = () => { seed = (seed * 16807) % 2147483647; return seed / 2147483647; };
-  const tasks = Array.from({ length: 80 }, (_, index) => ({
-    id: `t${index + 1}`, point: [Math.round(random() * 9000), Math.round(random() * 6000)], value: 1 + Math.floor(random() * 5), service_s: 0, must: index % 20 === 3, altitude_m: null, forbidden: false,
-  }));
-  Object.assign(state, { tasks: { system: "plane", meters_per_unit: 1, depot: [4500, 3000], source: "example", tasks }, solve: null, report: null, progress: null });
-  $("range").value = "15"; $("range-unit").value = "km";
+  Object.assign(state, {
+    tasks: exampleTasks(),
+    solve: null,
+    report: null,
+    progress: null,
+  });
+  $("range").value = "15";
+  $("range-unit").value = "km";
   changed();
   map.fit();
 }
 
 function clear() {
-  Object.assign(state, { tasks: emptyTasks(), uavs: null, solve: null, report: null, progress: null, selected: null, mode: null });
-  $("state").textContent = ""; $("progress").hidden = true;
+  Object.assign(state, {
+    tasks: emptyTasks(),
+    uavs: null,
+    solve: null,
+    report: null,
+    progress: null,
+    selected: null,
+    mode: null,
+  });
+  $("state").textContent = "";
+  $("progress").hidden = true;
   changed();
   map.fit();
 }
 
-$("file").addEventListener("change", (event) => { takeFile(event.target.files[0]); event.target.value = ""; });
-$("fleet-file").addEventListener("change", (event) => { takeFleet(event.target.files[0]); event.target.value = ""; });
+$("file").addEventListener("change", (event) => {
+  takeFile(event.target.files[0]);
+  event.target.value = "";
+});
+$("fleet-file").addEventListener("change", (event) => {
+  takeFleet(event.target.files[0]);
+  event.target.value = "";
+});
 for (const type of ["dragover", "dragleave", "drop"]) {
   document.addEventListener(type, (event) => {
     event.preventDefault();
@@ -301,26 +380,52 @@ $("add").addEventListener("click", () => setMode("add"));
 $("depot").addEventListener("click", () => setMode("depot"));
 $("example").addEventListener("click", example);
 $("clear").addEventListener("click", clear);
-$("system").addEventListener("change", () => { state.tasks = emptyTasks(); changed(); map.fit(); });
+$("system").addEventListener("change", () => {
+  state.tasks = emptyTasks();
+  changed();
+  map.fit();
+});
 $("split").addEventListener("click", () => {
   try {
     if (state.uavs) state.uavs = null;
     else {
-      const { count, ...uav } = fleet();
+      const { count, ...uav } = fleet(null);
       if (!(count >= 1 && count <= 100)) throw new Error("Give 1 to 100 UAVs.");
       state.uavs = Array.from({ length: count }, (_, index) => ({ id: `uav-${index + 1}`, ...uav, start: null, end: null }));
     }
     changed();
-  } catch (error) { refuse(error); }
+  } catch (error) {
+    refuse(error);
+  }
 });
-for (const name of FIELDS) $(name).addEventListener("change", () => { if (["count", "range", "range-unit", "speed", "reserve"].includes(name)) changed(); else { showResult(); save(); } });
+for (const name of FIELDS)
+  $(name).addEventListener("change", () => {
+    if (["count", "range", "range-unit", "speed", "reserve"].includes(name)) changed();
+    else {
+      showResult(state, select, showTask);
+      save();
+    }
+  });
 $("duplicates").addEventListener("change", save);
 $("solve").addEventListener("click", solve);
-$("cancel").addEventListener("click", async () => { try { state.progress = await ask("DELETE", `/api/v1/solves/${encodeURIComponent(state.solve)}`); showProgress(); show(); } catch (error) { refuse(error); } });
+$("cancel").addEventListener("click", async () => {
+  try {
+    state.progress = await ask("DELETE", `/api/v1/solves/${encodeURIComponent(state.solve)}`);
+    showProgress(state.progress);
+    show();
+  } catch (error) {
+    refuse(error);
+  }
+});
 $("zoom-in").addEventListener("click", () => map.zoom(1.5));
 $("zoom-out").addEventListener("click", () => map.zoom(1 / 1.5));
 $("fit").addEventListener("click", () => map.fit());
-document.addEventListener("keydown", (event) => { if (event.key === "Escape") { state.mode = null; select(null); } });
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape") {
+    state.mode = null;
+    select(null);
+  }
+});
 $("download").addEventListener("click", async (event) => {
   // Fetched, so that a refusal becomes a sentence instead of a page of JSON.
   event.preventDefault();
@@ -330,10 +435,13 @@ $("download").addEventListener("click", async (event) => {
     const answer = await fetch($("download").href);
     if (!answer.ok) throw new Error((await answer.json()).detail);
     const link = element("a");
-    link.href = URL.createObjectURL(await answer.blob()); link.download = "mission.zip";
+    link.href = URL.createObjectURL(await answer.blob());
+    link.download = "mission.zip";
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
-  } catch (error) { refuse(error); }
+  } catch (error) {
+    refuse(error);
+  }
   $("download").textContent = "Download all files (zip)";
 });
 
