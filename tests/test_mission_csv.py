@@ -159,13 +159,13 @@ TWO = "id,lat,lon\na,47,8\n"
         ("id,lat,lon\na,10,180\nb,10,-180\n", "row 3: task b is where task a (row 2) is"),
         ("id,x,y\na,8.1,47.1\nb,8.2,47.2\n", "row 2: x, y are 8.1, 47.1, and all points look like degrees; if so, name"),
         ("id,x_m,y_m\na,1e10,2\n", "row 2: x is 10000000000; coordinates must be within 1e+09 of the origin"),
-        ("id,lat,lon,value\na,47,8,-1\n", "row 2: value is -1; give a number from 0"),
+        ("id,lat,lon,value\na,47,8,-1\n", "row 2: value is '-1'; give a number of at least 0"),
         ("id,lat,lon,value\na,47,8,\n", "row 2: value is missing"),
-        ("id,lat,lon,service_min\na,47,8,-1\n", "row 2: service_s is -60; give a number from 0"),
+        ("id,lat,lon,service_min\na,47,8,-1\n", "row 2: service_min is '-1'; give a number of at least 0"),
         ("id,lat,lon,must\na,47,8,perhaps\n", "row 2: must is 'perhaps'; write yes or no"),
         ("id,lat,lon,alt_m\na,47,8,20000\n", "row 2: alt_m is 20000; give a number from -1000 to 10000"),
         ("id,lat,lon,depot\na,47,8,1\nb,46,8,1\nc,45,8,\n", "row 3: a second depot, after that in row 2"),
-        ("id,lat,lon,depot\na,99,8,1\nb,46,8,\n", "depot: lat is 99"),
+        ("id,lat,lon,depot\na,99,8,1\nb,46,8,\n", "row 2: lat is 99; latitudes are within 90 degrees"),
         (
             "id;lat;lon\na;47,1;8,2\nb;47.1;8\n",
             "row 2: lat is '47,1', but row 3 has '47.1' as lat; use either commas",
@@ -203,7 +203,7 @@ def test_other_columns_are_ignored():
 
 def test_a_depot_beside_a_flagged_row():
     text = "id,lat,lon,depot\na,47,8,x\nb,46,8,\n"
-    assert "a row is the depot already" in refusal(text, depot="47,8")
+    assert "one of the points is the depot already" in refusal(text, depot="47,8")
     assert read(text).depot.tolist() == [47, 8]
 
 
@@ -222,8 +222,8 @@ def test_too_many_rows(monkeypatch):
 def test_nothing_is_read_beyond_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_uav.missions.read.MAX_BYTES", 100)
     path = tmp_path / "large.csv"
-    path.write_text("id,lat,lon\n" + "#" * 1000)
-    with pytest.raises(ValueError, match="but at most 0 MiB are read; divide it"):
+    path.write_text("id,lat,lon\n" + "#" * 2**21)
+    with pytest.raises(ValueError, match=r"the file has 2\.0 MiB, but at most 0 MiB are read; divide it"):
         read_tasks(path)
 
 

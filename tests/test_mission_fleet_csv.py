@@ -7,6 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sb3_uav.missions.fleet import Fleet, Uav
+from sb3_uav.missions.problem import make_instance
 from sb3_uav.missions.read import read_fleet, read_fleet_from_bytes
 from sb3_uav.missions.readers.checks import MAX_FLEET, check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
@@ -133,6 +134,9 @@ def test_starts_are_in_the_coordinates_of_the_tasks():
     meters = TaskList.of("a", [[470, 8]], "plane", source="t.csv")
     by_columns = read("id,range_m,start_lat,start_lon\na,10,47,8\n")
     check_fits(degrees, by_columns)
+    check_fits(meters, Fleet((Uav("a", 10.0),), system="wgs84"))
+    with pytest.raises(ValueError, match=r"UAVs start or end at lat and lon, but t\.csv has x and y"):
+        make_instance(meters.with_depot((0, 0)), by_columns)
     with pytest.raises(ValueError, match=r"f.csv: UAVs start or end at lat and lon, but t.csv has x and y; use one system"):
         check_fits(meters, by_columns)
     in_a_cell = read("id,range_m,start\na,10,470 8\n")

@@ -124,6 +124,23 @@ def test_oplib():
         assert [uav.range_m for uav in tasks.fleet] == [10]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        # As tests with random bytes found it: a section after the end is none.
+        ("NODE_SCORE_SECTION", "EOF\nNODE_SCORE_SECTION", "DIMENSION is 3, but NODE_SCORE_SECTION has 0 lines"),
+        ("EOF", "Edge_Weight_SECTION\n1\nEOF", "the file lists distances, or has too many sections"),
+        ("EOF", "A_SECTION\n" * 20 + "EOF", "the file lists distances, or has too many sections"),
+        ("EUC_2D", "GEO", "EDGE_WEIGHT_TYPE is GEO; only EUC_2D can be solved"),
+    ],
+)
+def test_other_oplib_files(old, new, message):
+    pytest.importorskip("vrplib")
+    text = oplib_text(Instances.from_arrays([0, 0], [[1, 2], [3, 4]], [1, 2], 10, 1))
+    with pytest.raises(ValueError, match=message):
+        read_tasks_from_bytes("t.oplib", text.replace(old, new).encode())
+
+
 def test_an_npz_with_everything():
     tasks = read_tasks_from_bytes("t.npz", npz_bytes(whole_problem()), unit="km")
     assert tasks.ids == ("0", "1", "2")
@@ -176,6 +193,10 @@ def test_small_files_with_large_arrays_are_not_unpacked(monkeypatch):
     np.savez_compressed(file, tasks=np.zeros(2**20))
     assert len(file.getvalue()) < 2**16
     with pytest.raises(ValueError, match="the file holds 1 arrays of 8 MiB; at most 100 arrays of 1 MiB are read"):
+        read_tasks_from_bytes("t.npz", file.getvalue())
+    file = io.BytesIO()
+    np.savez(file, **{f"a{number}": np.zeros(1) for number in range(101)})
+    with pytest.raises(ValueError, match="the file holds 101 arrays of 0 MiB; at most 100 arrays"):
         read_tasks_from_bytes("t.npz", file.getvalue())
 
 
@@ -235,8 +256,59 @@ def test_other_tasks_are_refused(others, message):
         check_tasks(tasks_of(**others))
 
 
+GEOJSON = b"""{"type": "FeatureCollection", "features": [
+ {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.1, 47.1]}, "properties": {"id": "a", "value": 2}},
+ {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.0, 47.0]}, "properties": {"depot": true}}]}"""
+PLAN = b"""{"fileType": "Plan", "version": 1, "mission": {"version": 2, "plannedHomePosition": [47.0, 8.0, 400], "items": [
+ {"type": "SimpleItem", "command": 16, "frame": 3, "params": [5, 0, 0, null, 47.1, 8.1, 50], "doJumpId": 1}]}}"""
+WPL = b"QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t47\t8\t400\t1\n1\t0\t3\t16\t5\t0\t0\t0\t47.1\t8.1\t50\t1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("t.geojson", GEOJSON),
+        ("t.json", b"\xef\xbb\xbf" + GEOJSON),
+        ("t.plan", PLAN),
+        ("t.json", PLAN),
+        ("t.waypoints", WPL),
+        ("t.WPL", WPL),
+        ("t.txt", WPL),
+    ],
+)
+def test_maps_and_ground_stations(name, data):
+    tasks = read_tasks_from_bytes(name, data)
+    assert tasks.points.tolist() == [[47.1, 8.1]]
+    assert tasks.depot.tolist() == [47, 8]
+    with pytest.raises(ValueError, match="the unit 'km' is for x and y, but the file has lat and lon"):
+        read_tasks_from_bytes(name, data, unit="km")
+    if data is GEOJSON:
+        with pytest.raises(ValueError, match="one of the points is the depot already"):
+            read_tasks_from_bytes(name, data, depot="46,7")
+    elif data in (PLAN, WPL):
+        assert read_tasks_from_bytes(name, data, depot="46,7").depot.tolist() == [46, 7]
+
+
+def test_what_all_formats_share_is_checked_in_each():
+    for name, data in (("t.geojson", GEOJSON), ("t.plan", PLAN), ("t.wpl", WPL)):
+        with pytest.raises(
+            ValueError, match=r"lat is 147\.1; latitudes are within 90 degrees, and lon is 8\.1: are they swapped?"
+        ):
+            read_tasks_from_bytes(name, data.replace(b"47.1", b"147.1"))
+
+
+def test_the_unit_of_a_plane_in_geojson():
+    data = GEOJSON.replace(b"{", b'{"sb3_uav_plane": {"meters_per_unit": 1000}, ', 1)
+    assert read_tasks_from_bytes("t.geojson", data, unit="km").meters_per_unit == 1000
+    with pytest.raises(ValueError, match="the unit 'm' contradicts the file, whose unit is 1000 m; leave it out"):
+        read_tasks_from_bytes("t.geojson", data, unit="m")
+
+
 SEEDS = {
     "t.csv": CSV,
+    "t.geojson": GEOJSON,
+    "t.plan": PLAN,
+    "t.waypoints": WPL,
     "t.tsv": CSV.replace(b",", b"\t").replace(b".", b","),
     "t.txt": (FILES / "b1.2.a.txt").read_bytes(),
     "t.oplib": (FILES / "road8.oplib").read_bytes(),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -62,7 +61,8 @@ def read_tasks(
 
     :param path: The file
     :param unit: Unit of x and y, such as ``"km"``; what the file says, otherwise meters
-    :param depot: Where the UAVs start and land: ``"LAT,LON"`` or ``"X,Y"``, or two numbers; what the file says when None
+    :param depot: Where the UAVs start and land: ``"LAT,LON"`` or ``"X,Y"``, or two numbers; what the file says when None. It
+        replaces the home of a ground station and the depot of an instance, but not a point that is flagged as the depot
     :param allow_duplicates: Whether tasks may be at the same place
     :param row: Which instance of an ``.npz`` with several, from 0
     :return: The tasks, checked
@@ -104,8 +104,9 @@ def read_tasks_from_bytes(
         raise ValueError(f"{source}: row {row} is asked for, but only .npz files have rows of instances; leave it out.")
     tasks = _read(form, data, source, unit, row)
     if depot is not None:
-        if form == "csv" and tasks.depot is not None:
-            raise ValueError(f"{source}: a row is the depot already; leave out the depot that is given beside the file.")
+        # Homes in the files of ground stations are where somebody planned, not where somebody flies.
+        if form in ("csv", "geojson") and tasks.depot is not None:
+            raise ValueError(f"{source}: one of the points is the depot already; leave out the depot beside the file.")
         point = parse_point(depot) if isinstance(depot, str) else depot
         tasks = tasks.with_depot(np.array(point, float))
     check_tasks(tasks, allow_duplicates)
@@ -222,7 +223,11 @@ def _read(form: Format, data: bytes, source: str, unit: str | None, row: int | N
         return tasks
     if tasks.system != "plane":
         raise ValueError(f"{source}: the unit {unit!r:.40} is for x and y, but the file has lat and lon; leave it out.")
-    return replace(tasks, meters_per_unit=length_unit(unit))
+    if tasks.meters_per_unit != length_unit(unit):
+        raise ValueError(
+            f"{source}: the unit {unit!r:.40} contradicts the file, whose unit is {tasks.meters_per_unit:g} m; leave it out."
+        )
+    return tasks
 
 
 def _read_map(form: Format, data: bytes, source: str) -> TaskList:

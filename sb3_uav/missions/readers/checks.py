@@ -182,7 +182,8 @@ def check_fits(tasks: TaskList, fleet: Fleet) -> None:
     :param fleet: The UAVs
     :raises ValueError: If starts or ends of UAVs cannot be in the coordinates of the tasks
     """
-    if fleet.system is not None and fleet.system != tasks.system:
+    has_places = any(uav.start is not None or uav.end is not None for uav in fleet)
+    if has_places and fleet.system is not None and fleet.system != tasks.system:
         named = {"wgs84": "lat and lon", "plane": "x and y"}
         raise ValueError(
             f"{fleet.source}: UAVs start or end at {named[fleet.system]}, but {tasks.source} has {named[tasks.system]}; "

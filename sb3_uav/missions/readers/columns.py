@@ -167,13 +167,14 @@ class Cells:
         """:return: Beginning of messages on a row"""
         return f"{self.table.source}: row {self.table.rows[row][0]}"
 
-    def number(self, row: int, name: str, empty: float | None = None) -> float:
+    def number(self, row: int, name: str, empty: float | None = None, least: float = -math.inf) -> float:
         """
         :param row: Number of the row, from 0
         :param name: Name of a field that has a column
         :param empty: What an empty cell means; an error when None
+        :param least: Least number that is allowed
         :return: The number, as it stands there
-        :raises ValueError: If it is no finite number
+        :raises ValueError: If it is no finite number, or too small
         """
         text = self.text(row, name)
         if not text and empty is not None:
@@ -188,6 +189,8 @@ class Cells:
             raise ValueError(f"{self.where(row)}: {title} is {text!r:.60}, which is no number; {advice}.") from None
         if not math.isfinite(number):
             raise ValueError(f"{self.where(row)}: {title} is {text!r:.60}; give a finite number.")
+        if number < least:
+            raise ValueError(f"{self.where(row)}: {title} is {text!r:.60}; give a number of at least {least:g}.")
         return number
 
     def flag(self, row: int, name: str) -> bool:

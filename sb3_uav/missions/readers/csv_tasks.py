@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from sb3_uav.missions.coordinates import System
-from sb3_uav.missions.readers.checks import MAX_TASKS, check_not_degrees
+from sb3_uav.missions.readers.checks import MAX_TASKS, check_not_degrees, check_tasks
 from sb3_uav.missions.readers.columns import Cells, Column, Field, match_columns
 from sb3_uav.missions.readers.table import Table, read_table
 from sb3_uav.missions.tasks import TaskList
@@ -86,14 +86,15 @@ def read_csv_tasks(data: bytes, source: str, unit: str | None = None) -> TaskLis
     if not tasks:
         raise ValueError(f"{source}: there is no task below the header; give at least one row.")
     axes = ("lat", "lon") if system == "wgs84" else ("x", "y")
+    depot = _depot(cells, depots, axes, system) if depots else None
     read = TaskList.of(
         [_name(cells, row, number) for number, row in enumerate(tasks, start=1)],
         [[cells.number(row, axis) for axis in axes] for row in tasks],
         system,
-        [cells.number(row, "value") for row in tasks] if "value" in columns else None,
-        _scaled(cells, tasks, "service", 0.0) if "service" in columns else None,
+        [cells.number(row, "value", least=0) for row in tasks] if "value" in columns else None,
+        _scaled(cells, tasks, "service", 0.0, least=0) if "service" in columns else None,
         [cells.flag(row, "must") for row in tasks],
-        depot=[cells.number(depots[0], axis) for axis in axes] if depots else None,
+        depot=depot,
         altitudes=_scaled(cells, tasks, "alt", math.nan) if "alt" in columns else np.full(len(tasks), np.nan),
         meters_per_unit=meters_per_unit,
         places=tuple(f"row {table.rows[row][0]}" for row in tasks),
@@ -104,9 +105,9 @@ def read_csv_tasks(data: bytes, source: str, unit: str | None = None) -> TaskLis
     return read
 
 
-def _scaled(cells: Cells, rows: list[int], name: str, empty: float) -> np.ndarray:
+def _scaled(cells: Cells, rows: list[int], name: str, empty: float, least: float = -math.inf) -> np.ndarray:
     """:return: ``(n_rows,)``, numbers in the unit that we use"""
-    numbers: np.ndarray = np.array([cells.number(row, name, empty) for row in rows]) * cells.columns[name].factor
+    numbers: np.ndarray = np.array([cells.number(row, name, empty, least) for row in rows]) * cells.columns[name].factor
     return numbers
 
 
@@ -117,6 +118,17 @@ def _name(cells: Cells, row: int, number: int) -> str:
     if not name:
         raise ValueError(f"{cells.where(row)}: {cells.columns['id'].title} is missing; fill the cell.")
     return name
+
+
+def _depot(cells: Cells, rows: list[int], axes: tuple[str, str], system: System) -> list[float]:
+    """
+    :return: The depot
+    :raises ValueError: If it is not where a task might be; the message names its row, which the tasks do not
+    """
+    point = [cells.number(rows[0], axis) for axis in axes]
+    place = f"row {cells.table.rows[rows[0]][0]}"
+    check_tasks(TaskList.of(["depot"], [point], system, places=(place,), source=cells.table.source))
+    return point
 
 
 def _is_depot(cells: Cells, row: int) -> bool:

@@ -8,6 +8,7 @@ time that takes at 1 m/s, which is then the speed of the UAVs.
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import fields
@@ -24,6 +25,7 @@ from sb3_uav.missions.tasks import TaskList
 
 # 100,000 tasks take less than half; vrplib is slow.
 _MOST_TEXT_BYTES = 8 * 2**20
+_MOST_SECTIONS = 20
 # Of all arrays of a file together; deflate packs a thousandfold.
 _MOST_NPZ_BYTES = 256 * 2**20
 _MOST_NPZ_ARRAYS = 100
@@ -56,6 +58,9 @@ def read_oplib_tasks(data: bytes, source: str, meters_per_unit: float = 1.0) -> 
     :raises ValueError: If it is damaged, or its metric is not EUC_2D
     :raises ImportError: If vrplib is not installed
     """
+    # Whatever the metric, vrplib would build the matrix; and it copies the whole file for every section.
+    if re.search(rb"edge_weight_section", data, re.IGNORECASE) or data.count(b"_SECTION") > _MOST_SECTIONS:
+        raise ValueError(f"{source}: the file lists distances, or has too many sections; only EUC_2D can be solved.")
     instance = read_oplib(Path(source), _text(data, source), "")
     return _task_list(instance.instances, instance.nodes, [f"node {node}" for node in instance.nodes], source, meters_per_unit)
 
@@ -105,7 +110,9 @@ def _text(data: bytes, source: str) -> str:
     if len(data) > _MOST_TEXT_BYTES:
         raise ValueError(f"{source}: the file has {len(data)} bytes; at most {_MOST_TEXT_BYTES} of an instance are read.")
     # Comments may be in any encoding; where numbers are damaged, the readers say so.
-    return data.decode("utf-8-sig", errors="replace")
+    text = data.decode("utf-8-sig", errors="replace")
+    # Over a million spaces in a line, the expressions of vrplib would go a million times.
+    return "\n".join(" ".join(line.split()) for line in text.splitlines())
 
 
 def _task_list(
