@@ -11,7 +11,9 @@ from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.labels import (
     count,
     escaped,
+    flies,
     headline,
+    ink_on,
     meters,
     number,
     position,
@@ -26,7 +28,7 @@ from sb3_uav.missions.tasks import TaskList
 
 _WIDTH, _HEIGHT, _BORDER = 640.0, 440.0, 18.0
 # More would make notebooks heavy, and the picture no clearer.
-_MAX_POINTS, _MAX_TITLES, _MAX_ROWS = 2_000, 500, 20
+_MAX_POINTS, _MAX_TITLES, _MAX_NUMBERS, _MAX_ROWS = 2_000, 500, 60, 20
 _SENTENCE = 1_000
 _GRAY, _RED = "#7d838a", "#B3261E"
 
@@ -37,24 +39,32 @@ def plan_html(plan: Plan) -> str:
     :return: A map to scale and what the plan achieves, names escaped
     """
     points = map_points(plan)
-    view = _View(np.vstack([np.zeros((1, 2)), points.tasks, *points.routes]))
-    titled = len(plan.tasks) <= _MAX_TITLES
-    marks = []
-    shown = plan.skipped[:_MAX_POINTS]
-    for one in shown:
+    view = _View(points.focus if points.is_focused else points.whole)
+    is_small, titled = plan.n_served <= _MAX_NUMBERS, len(plan.tasks) <= _MAX_TITLES
+    radius = 7.0 if is_small else 4.0 if len(plan.tasks) <= _MAX_TITLES else 2.5
+    marks, lines = [], []
+    for one in plan.skipped[:_MAX_POINTS]:
         must = bool(plan.tasks.must[one.task])
         title = f"{plan.tasks.ids[one.task]}: {why_skipped(one)}" if titled else ""
-        marks.append(view.mark(points.tasks[one.task], 3.5, "none", _RED if must else _GRAY, 1.3, must, title))
-    radius = 3.0 if plan.n_served > 150 else 4.5
-    lines = []
+        marks.append(view.mark(points.tasks[one.task], min(radius, 3.5), "none", _RED if must else _GRAY, 1.3, must, title))
     for uav, (route, corners) in enumerate(zip(plan.routes, points.routes, strict=True)):
         look = uav_look(uav)
         lines.append(view.line(corners, uav_color(uav), look.dash_array))
+        for row, does in ((0, "starts"), (-1, "ends")):
+            if np.any(corners[row]) and flies(route):
+                marks.append(view.site(corners[row], uav_color(uav), f"{route.uav.id} {does} here"))
         for place, (stop, point) in enumerate(zip(route.stops, corners[1:-1], strict=False), 1):
             must = bool(plan.tasks.must[stop])
             title = f"{plan.tasks.ids[stop]}: stop {place} of {route.uav.id}" if titled else ""
             edge = "#000000" if must else look.edge
             marks.append(view.mark(point, radius, look.fill, edge, look.edge_width, must, title))
+            if is_small:
+                marks.append(view.number(point, place, ink_on(look.fill)))
+    if points.n_outside:
+        verb = "lies" if points.n_outside == 1 else "lie"
+        outside = f"<div>{count(points.n_outside, 'task')} {verb} far away, outside of this picture</div>"
+    else:
+        outside = ""
     names = [
         f"<tr>{_cell(uav_sample(uav), 'left')}{_cell(escaped(route.uav.id), 'left')}{_cell(route_facts(route), 'left')}</tr>"
         for uav, route in enumerate(plan.routes[:_MAX_ROWS])
@@ -64,8 +74,8 @@ def plan_html(plan: Plan) -> str:
     remarks = "".join(f"<div>{escaped(remark, _SENTENCE)}</div>" for remark in plan.remarks[:_MAX_ROWS])
     return (
         f"<div><div><b>{escaped(plan.tasks.source)}</b>: {escaped(headline(plan), _SENTENCE)}</div>"
-        f"{view.svg([*lines, *marks, view.depot(np.zeros(2))])}"
-        f'<table style="border-collapse:collapse">{"".join(names)}</table>{remarks}</div>'
+        f"{view.svg([*lines, *marks, view.depot(np.zeros(2))])}{outside}"
+        f'<table style="border-collapse:collapse;margin:4px 0">{"".join(names)}</table>{remarks}</div>'
     )
 
 
@@ -99,7 +109,7 @@ def fleet_html(fleet: Fleet) -> str:
     }
     rows = [f"<tr>{''.join(map(_cell, _facts(uav), columns.values()))}</tr>" for uav in fleet.uavs[:_MAX_POINTS]]
     more = f"<div>and {count(len(fleet) - _MAX_POINTS, 'more UAV')}</div>" if len(fleet) > _MAX_POINTS else ""
-    titles = "".join(f'<th style="text-align:{align}">{name}</th>' for name, align in columns.items())
+    titles = "".join(f'<th style="text-align:{align};padding:1px 10px 1px 0">{name}</th>' for name, align in columns.items())
     return (
         f"<div><div><b>{escaped(fleet.source)}</b>: {count(len(fleet), 'UAV')}</div>"
         f"<table><thead><tr>{titles}</tr></thead><tbody>{''.join(rows)}</tbody></table>{more}</div>"
@@ -126,7 +136,7 @@ def _facts(uav: Uav) -> tuple[str, ...]:
 
 
 def _cell(content: str, align: str) -> str:
-    return f'<td style="text-align:{align}">{content}</td>'
+    return f'<td style="text-align:{align};padding:1px 10px 1px 0">{content}</td>'
 
 
 def _tasks_svg(tasks: TaskList) -> str:
@@ -200,15 +210,26 @@ class _View:
             return f'<rect x="{corner[0]:.1f}" y="{corner[1]:.1f}" width="{side:g}" height="{side:g}" {style}>{inside}</rect>'
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" {style}>{inside}</circle>'
 
+    def number(self, point: np.ndarray, number: int, ink: str) -> str:
+        x, y = self._at(point)
+        style = f'font-size="9" font-family="sans-serif" text-anchor="middle" fill="{ink}" pointer-events="none"'
+        return f'<text x="{x:.1f}" y="{y + 3.2:.1f}" {style}>{number}</text>'
+
+    def site(self, point: np.ndarray, color: str, title: str) -> str:
+        x, y = self._at(point)
+        triangle = f'<path d="M{x:.1f} {y - 7:.1f}l6.5 11h-13z" fill="{color}" stroke="#000000">'
+        return f"{triangle}<title>{escaped(title, 150)}</title></path>"
+
     def depot(self, point: np.ndarray) -> str:
         x, y = self._at(point)
         diamond = f"M{x:.1f} {y - 8:.1f}l8 8-8 8-8-8z"
         return f'<path d="{diamond}" fill="#000000" stroke="#ffffff" stroke-width="1.5"><title>depot</title></path>'
 
     def svg(self, marks: Sequence[str]) -> str:
+        style = "max-width:100%;height:auto;overflow:hidden;background:#fafbfc"
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {self._height:.0f}" width="{_WIDTH:g}" '
-            f'style="max-width:100%;height:auto;background:#fafbfc" role="img">{"".join(marks)}{self._ruler()}</svg>'
+            f'style="{style}" role="img">{"".join(marks)}{self._ruler()}</svg>'
         )
 
     def _ruler(self) -> str:

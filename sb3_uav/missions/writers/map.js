@@ -128,6 +128,10 @@
   const config = {
     responsive: true,
     scrollZoom: true,
+    // To everything, from any view; a button leads back to the view of the beginning.
+    doubleClick: "autosize",
+    // Newer versions of plotly wait longer, and take clicks on two stops for a double-click.
+    doubleClickDelay: 300,
     displaylogo: false,
     plotlyServerURL: "",
     // Those that plotly adds by itself differ between its versions, and some share the figure with a service.

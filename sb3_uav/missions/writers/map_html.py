@@ -85,7 +85,7 @@ def map_page(plan: Plan) -> str:
             "<noscript><p>The map needs JavaScript; the tables do not.</p></noscript>",
             _outside(plan),
             '<p class="hint">Click a tour or a stop to light up its UAV, and again to reset. Click the legend to hide a UAV. '
-            "Scroll to zoom, which also numbers stops that lie close together; drag to move, double-click to see everything.</p>",
+            "Scroll to zoom: stops that lie close together get their numbers then. Drag to move, double-click to see all.</p>",
             _routes_table(plan),
             _skipped_table(plan),
             f'<p class="made">{_made_by(plan)}</p>',
