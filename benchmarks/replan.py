@@ -109,14 +109,14 @@ def half_flown(plan: Plan, seed: int, n_new: int = 10) -> Status:
     return Status(tuple(reports), tuple(done), (plan.fleet.uavs[lost].id,), new)
 
 
-def _report(source: str, seeds: Sequence[int], n_tasks: int, n_uavs: int, time_limit: float) -> str:
+def _report(source: str, seeds: Sequence[int], n_tasks: int, n_uavs: int, time_limit: float, min_gain: float) -> str:
     """:return: A row of the table"""
     seconds, kept, values, anew, methods, must = [], [], [], [], [], 0
     for seed in seeds:
         plan = some_plan(n_tasks, n_uavs, seed, source)
         status = half_flown(plan, seed)
         start = time.perf_counter()
-        found = replan(plan, status, time_limit, seed)
+        found = replan(plan, status, time_limit, seed, min_gain)
         seconds.append(time.perf_counter() - start)
         scratch = solve(found.plan.tasks, found.plan.fleet, source, 0.5, seed)
         must += len(found.plan.unserved) - len(scratch.unserved)
@@ -148,6 +148,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="solvers of the old plans and of plans anew (default: %(default)s)",
     )
     parser.add_argument("--time-limits", type=float, nargs="+", default=[0.0, 0.5], help="of replan (default: %(default)s)")
+    parser.add_argument("--min-gain", type=float, default=0.0, help="of replan, in percent (default: %(default)g)")
     args = parser.parse_args(argv)
     th.set_num_threads(1)
     warm_up()
@@ -155,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for source in args.sources:
         for time_limit in args.time_limits:
-            print(_report(source, range(args.seeds), args.n_tasks, args.n_uavs, time_limit), flush=True)
+            print(_report(source, range(args.seeds), args.n_tasks, args.n_uavs, time_limit, args.min_gain), flush=True)
 
 
 if __name__ == "__main__":

@@ -104,6 +104,8 @@ RULES = [
     # The files beside the tests have other names.
     Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
     Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),
+    Rule("docs/missions.md", r"(sb3-uav solve .*) -o", r"\1 --time-limit 1 -o"),
+    Rule("docs/missions.md", r"time_limit=10", "time_limit=1"),
     Rule("docs/results/*", r"U4-N80\.npz U6-N80\.npz \.\.\. \S+", "U4-N80.npz"),
     Rule("docs/results/*", r"U4-N500\.npz U6-N200\.npz", "U4-N80.npz"),
     Rule("docs/results/*", r"(time_limit|polish)=10?\b", r"\1=0.2"),

@@ -121,7 +121,7 @@ def test_summary(tmp_path: Path) -> None:
     assert [(skipped["task"], skipped["reason"]) for skipped in summary["skipped"]] == [("d", "did not fit")]
     assert summary["unserved_must"] == ["d"] and any("must be: d" in remark for remark in summary["remarks"])
     assert summary["checker"]["verdict"] == "feasible" and 0.5 < summary["checker"]["largest_share_of_usable_range"] <= 1
-    assert {"python", "numpy", "sb3-uav"} <= set(summary["versions"])
+    assert {"python", "numpy", "pyproj", "sb3-uav"} <= set(summary["versions"])
     assert set(summary["files"]) == names(tmp_path / "out") - {"summary.json"}
 
 

@@ -88,6 +88,32 @@ def test_units_of_what_remains(unit, number):
     assert again.plan.routes[0].uav.range_m == 30.0
 
 
+@pytest.mark.parametrize(
+    ("gone", "n_remaining"),
+    [
+        # From the start to t1 and on to t2; over again to t3, from where the UAV flies to its end.
+        (("t3",), 2),
+        # To t1, and from t3 to the end.
+        (("t2",), 2),
+        # From where it is to t2, on to t3, to the end.
+        (("t1",), 3),
+        # Only the flight to the end.
+        (("t1", "t2", "t3"), 1),
+    ],
+)
+def test_legs_of_tasks_that_are_done_do_not_count(gone, n_remaining):
+    plan = line_plan([1, 2, 3], n_tasks=4, ranges=[6.0])
+    found = replan(plan, Status(uavs=(UavReport("a", (0.0, 0.5), 3.2 if len(gone) == 3 else 6.0),), done=gone), 0.0)
+    check(found)
+    assert found.n_remaining == n_remaining
+
+
+def test_more_than_the_whole_range_is_not_believed():
+    found = replan(line_plan([1]), Status(uavs=(UavReport("a", (0.0, 0.5), 120.0),)), 0.0)
+    assert found.plan.fleet.uavs[0].range_m == 100.0
+    assert found.remarks[0] == "UAV a reports 120 m, more than its whole range; 100 m are assumed."
+
+
 def test_what_the_range_no_longer_admits_is_left_out():
     # 12 m to t6 and back. With 11 m left, a detour must go: t6, which is worth most but must not be; t5 must.
     plan = line_plan([5, 6], values=[1, 1, 1, 1, 1, 9], must=[False] * 4 + [True, False])
@@ -184,6 +210,9 @@ def test_a_status_file_may_grow():
     assert third.plan.past_tasks == ("t1", "n")
     # The row of n is still there, and n is done.
     assert not replan(third.plan, Status((), ("t1", "n"), ("b",), (new,)), 0.0).added
+    # A task that was done before it was planned.
+    at_once = replan(plan, Status(done=("t1", "n"), tasks=(new,)), 0.0)
+    assert (at_once.added, at_once.gone, at_once.plan.past_tasks) == ((), ("t1",), ("t1", "n"))
 
 
 @pytest.mark.parametrize(

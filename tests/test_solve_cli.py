@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,11 @@ import pytest
 
 import sb3_uav.missions
 from sb3_uav.cli import main as cli
+from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.cli.mission_report import Progress, exit_code, print_plan, why_empty
 from sb3_uav.missions import Fleet, Plan, TaskList, Uav, load_plan, solve
 from sb3_uav.missions.fleet_options import FleetOptions
+from sb3_uav.solvers import NoScheduleError
 
 rich_console = pytest.importorskip("rich.console")
 pytest.importorskip("matplotlib")
@@ -105,7 +109,7 @@ FLEET = ("--uavs", "2", "--range", "6km")
         ((*FLEET, "--fleet", "fleet.csv"), "--fleet says it all"),
         ((*FLEET, "--reserve", "100"), "--reserve is 100; give a percentage"),
         ((*FLEET, "--reserve", "nan"), "--reserve is nan"),
-        ((*FLEET, "--depot", "47,8"), "a row is the depot already"),
+        ((*FLEET, "--depot", "47,8"), "is the depot already"),
         ((*FLEET, "--unit", "km"), "unit"),
         ((*FLEET, "--time-limit", "0"), "--time-limit is 0"),
         ((*FLEET, "--time-limit", "nan"), "--time-limit is nan"),
@@ -158,6 +162,33 @@ def test_ctrl_c_writes_nothing(tasks_csv: Path, monkeypatch: pytest.MonkeyPatch)
     assert not Path("out").exists()
 
 
+def test_a_solver_without_a_plan(tasks_csv: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def give_up(*_: Any) -> None:
+        raise NoScheduleError("out of time")
+
+    monkeypatch.setattr("sb3_uav.missions.search.solve", give_up)
+    assert run("tasks.csv", *FLEET, "-o", "out") == 2
+    assert "The solver found no plan: out of time" in capsys.readouterr().err and not Path("out").exists()
+
+
+def test_ctrl_c_does_not_wait_for_the_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    ended: list[Any] = []
+    monkeypatch.setattr("os._exit", ended.append)
+    with ends_at_once("sb3-uav solve", lambda: ended.append("cleaned up")):
+        signal.raise_signal(signal.SIGINT)
+    assert ended == ["cleaned up", 130] and capsys.readouterr().err == "sb3-uav solve: interrupted\n"
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    # As under nohup.
+    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with ends_at_once("sb3-uav solve"):
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
 def test_a_depot_in_the_south(tasks_csv: Path) -> None:
     tasks_csv.write_text("id,lat,lon\na,-33.0,151.01\n", encoding="utf-8")
     assert run("tasks.csv", "--depot", "-33.0,151.0", *FLEET, *FAST, "-o", "out") == 0
@@ -180,21 +211,11 @@ def test_flight_options_reach_the_files(tasks_csv: Path) -> None:
     assert (missions[0]["firmwareType"], missions[0]["vehicleType"], missions[0]["items"][-1]["command"]) == (3, 1, 21)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "fleet", "n_tasks", "least"),
-    [
-        ("orchard.csv", ("--uavs", "2", "--endurance", "18min", "--speed", "8m/s", "--reserve", "20"), 120, 108),
-        ("city.geojson", ("--fleet", str(EXAMPLES / "city_fleet.csv")), 400, 180),
-        ("lattice.csv", ("--uavs", "4", "--range", "3km", "--reserve", "10"), 100, 88),
-    ],
-)
-def test_examples(tmp_path: Path, name: str, fleet: tuple[str, ...], n_tasks: int, least: int) -> None:
-    """With the solver that users get."""
-    pytest.importorskip("numba")
-    assert run(str(EXAMPLES / name), *fleet, "--time-limit", "1", "-o", str(tmp_path / "out")) == 0
-    plan = load_plan(tmp_path / "out" / "mission.json")
-    assert len(plan.tasks) == n_tasks and plan.n_served >= least and not plan.unserved
+def test_commands_of_the_examples_are_those_of_the_docs() -> None:
+    """Where they run, see `test_doc_blocks.py`."""
+    commands = re.findall(r"`(sb3-uav .*?)`", (EXAMPLES / "README.md").read_text(encoding="utf-8"))
+    page = (EXAMPLES.parents[1] / "docs" / "missions.md").read_text(encoding="utf-8").splitlines()
+    assert len(commands) == 4 and set(commands) <= set(page)
 
 
 def test_example_data_is_what_the_script_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,12 +294,16 @@ def test_why_a_plan_may_be_empty_though_tasks_are_in_reach() -> None:
 def test_progress_on_a_terminal() -> None:
     console = rich_console.Console(file=io.StringIO(), force_terminal=True, width=80)
     with Progress(5.0, console) as progress:
+        progress._live.refresh()
+        assert "loading the solver" in console.file.getvalue()
+        progress.begin()
         progress(small_plan())
         progress._live.refresh()
     assert "of 5 s: 3 of 3 tasks, value 3" in console.file.getvalue()
     console = rich_console.Console(file=io.StringIO(), width=80)
     with Progress(5.0, console) as progress:
-        progress(small_plan())
+        solve(small_plan().tasks, Fleet.of_equal(1, 1e4), "greedy-insertion", on_plan=progress, on_start=progress.begin)
+        assert progress._start is not None
     assert console.file.getvalue() == ""
 
 

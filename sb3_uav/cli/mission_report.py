@@ -15,6 +15,8 @@ from sb3_uav.missions.plan import Plan, Reason
 from sb3_uav.missions.remarks import named
 
 _OK, _NOT_DONE = 0, 1
+# Characters of the bar that shows the time.
+_BAR = 20
 
 
 def exit_code(plan: Plan) -> int:
@@ -91,7 +93,7 @@ def _table(rich: Any, plan: Plan) -> Any:
         table.add_column(heading, justify="right", no_wrap=True)
     for route in plan.routes:
         cells = [str(len(route.stops)), meters(route.length_m), meters(route.used_m), percent(route.share_of_range)]
-        cells += [f"{route.uav.reserve_percent:.4g} %"] if keeps_reserve else []
+        cells += [f"{route.uav.reserve_percent:.3g} %"] if keeps_reserve else []
         cells += ["-" if route.seconds is None else _time(route.seconds)] if is_timed else []
         table.add_row(rich.text.Text(shown(route.uav.id)), *cells)
     return table
@@ -115,10 +117,11 @@ def _time(seconds: float) -> str:
 
 class Progress:
     """
-    One line on a terminal: elapsed time against the limit, and the best plan so far. Use it as a context manager, and as
-    ``on_plan`` of :func:`~sb3_uav.missions.search.solve`. Without a terminal it shows nothing.
+    One line on a terminal: elapsed time against the limit, and the best plan so far. Use it as a context manager, as
+    ``on_plan`` of :func:`~sb3_uav.missions.search.solve`, and :meth:`begin` as its ``on_start``. Without a terminal it shows
+    nothing.
 
-    :param time_limit: Seconds that the solver has
+    :param time_limit: Seconds that the solver has, above 0
     :param console: A rich console; the standard error when None
     :raises ImportError: If rich is not installed
     """
@@ -129,20 +132,27 @@ class Progress:
 
         self._rich = rich
         self._limit = time_limit
-        self._start = time.perf_counter()
+        self._start: float | None = None
         self._best = "no plan yet"
         self._lock = threading.Lock()
         console = rich.console.Console(file=sys.stderr) if console is None else console
         self._live = Live(console=console, get_renderable=self._line, refresh_per_second=5, transient=True)
         self._is_shown = console.is_terminal
 
-    def __enter__(self) -> Progress:
+    def begin(self) -> None:
+        """The solver is loaded, its time begins."""
         self._start = time.perf_counter()
+
+    def __enter__(self) -> Progress:
         if self._is_shown:
             self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """Clear the line and show the cursor again."""
         if self._is_shown:
             self._live.stop()
 
@@ -155,7 +165,10 @@ class Progress:
             self._best = best
 
     def _line(self) -> Any:
+        if self._start is None:
+            return self._rich.text.Text("loading the solver")
         elapsed = time.perf_counter() - self._start
-        full = int(20 * min(elapsed / self._limit, 1.0)) if self._limit > 0 else 20
+        full = int(_BAR * min(elapsed / self._limit, 1.0))
         with self._lock:
-            return self._rich.text.Text(f"{'━' * full}{' ' * (20 - full)} {elapsed:4.1f} of {self._limit:g} s: {self._best}")
+            text = f"{'━' * full}{' ' * (_BAR - full)} {elapsed:4.1f} of {self._limit:g} s: {self._best}"
+        return self._rich.text.Text(text, no_wrap=True, overflow="ellipsis")

@@ -160,18 +160,16 @@ def _print_changes(found: Replanned) -> None:
     lines = [] if plan.notes else [f"Nothing has changed: all of {count(found.n_remaining, 'leg')} left to fly are kept."]
     if found.unchanged:
         lines.append(f"Routes that stay as they are: {named(list(map(shown, found.unchanged)))}.")
-    for what, names in (("tasks done or dropped", found.gone), ("UAVs lost", found.lost)):
+    for what, names in (("Done or dropped", found.gone), ("Lost", found.lost)):
         if names:
-            lines.append(f"{len(names)} {what}: {named(list(map(shown, names)))}.")
-    for what, names in (("new tasks", found.added), ("tasks of lost UAVs", found.freed)):
+            lines.append(f"{what}: {named(list(map(shown, names)))}.")
+    for what, names in (("New tasks", found.added), ("Tasks of lost UAVs", found.freed)):
         if names:
             left_out = [shown(name) for name in names if name not in served]
-            lines.append(
-                f"{len(names)} {what}, {len(names) - len(left_out)} of them served"
-                + (f"; not {named(left_out)}." if left_out else ".")
-            )
+            more = f", not {named(left_out)}" if left_out else ""
+            lines.append(f"{what}: {len(names) - len(left_out)} of {len(names)} served{more}.")
     others = [shown(name) for name in found.removed if name not in found.freed]
     if others:
-        lines.append(f"{len(others)} planned tasks no longer served: {named(others)}.")
+        lines.append(f"No longer served: {named(others)}.")
     for line in lines:
         console.print(rich.text.Text(line, overflow="fold"))

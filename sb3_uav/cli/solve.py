@@ -10,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.common.optional import require
 from sb3_uav.missions.flight import Firmware, FlightOptions, Landing, Vehicle
 
@@ -137,6 +138,7 @@ def main(argv: Sequence[str]) -> int:
     from sb3_uav.missions.read import read_tasks
     from sb3_uav.missions.search import solve
     from sb3_uav.missions.write import check_folder, checked, write_mission
+    from sb3_uav.solvers.base import NoScheduleError
 
     # What may be missing or wrong is found before the long run, not after it.
     require("rich", "The summary of a mission", "missions")
@@ -149,8 +151,11 @@ def main(argv: Sequence[str]) -> int:
     tasks = read_tasks(args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row)
     options = FleetOptions(args.fleet, args.uavs, args.range, args.endurance, args.speed, args.reserve)
     fleet = options.fleet(tasks)
-    with Progress(args.time_limit) as progress:
-        plan = solve(tasks, fleet, args.solver, args.time_limit, args.seed, progress)
+    with Progress(args.time_limit) as progress, ends_at_once("sb3-uav solve", progress.end):
+        try:
+            plan = solve(tasks, fleet, args.solver, args.time_limit, args.seed, progress, progress.begin)
+        except NoScheduleError as error:
+            raise ValueError(f"The solver found no plan: {error}") from error
     files = write_mission(plan, args.out, flight, args.overwrite)
     print_plan(checked(plan, flight), files)
     return exit_code(plan)

@@ -43,6 +43,7 @@ def solve(
     time_limit: float = DEFAULT_SECONDS,
     seed: int = 0,
     on_plan: Callable[[Plan], None] | None = None,
+    on_start: Callable[[], None] | None = None,
 ) -> Plan:
     """
     Plan the mission.
@@ -53,6 +54,7 @@ def solve(
     :param time_limit: Seconds
     :param seed: Seed of the solver
     :param on_plan: Called with every better plan as soon as it is known, possibly in another thread
+    :param on_start: Called when the solver is loaded and its time begins
     :return: The best plan, accepted by the checker, with lengths measured anew in the coordinates of the user
     :raises ValueError: If the input is wrong; the message names the file and the row
     :raises InfeasibleScheduleError: If the solver is at fault
@@ -67,6 +69,8 @@ def solve(
     chosen = make_solver(solver or default_spec(instance, time_limit), device="cpu")
     chosen.check(instance)
     chosen.prepare()
+    if on_start is not None:
+        on_start()
     start = time.perf_counter()
 
     def plan_of(schedule: Schedule) -> Plan:

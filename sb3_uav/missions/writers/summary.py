@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ def summary_of(plan: Plan, flight: FlightOptions, files: Mapping[str, str] | Non
         "seconds": round(plan.seconds, 3),
         "flight": asdict(flight),
         "source": {**source, "fleet": {"file": plan.fleet.source, "sha256": plan.fleet.sha256 or None}},
-        **describe_machine(),
+        **_machine(),
         "files": dict(files or {}),
     }
 
@@ -74,6 +76,14 @@ def write_summary(plan: Plan, path: Path, flight: FlightOptions, files: Mapping[
     """
     text = json.dumps(summary_of(plan, flight, files), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(path, text + "\n")
+
+
+def _machine() -> dict[str, Any]:
+    machine = describe_machine()
+    # What lengths on the ellipsoid depend on.
+    with suppress(metadata.PackageNotFoundError):
+        machine["versions"]["pyproj"] = metadata.version("pyproj")
+    return machine
 
 
 def _uav(route: Route, altitude: float) -> dict[str, Any]:
