@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[1]
 # Pages whose blocks have a test of their own.
 TESTED_ELSEWHERE = {
     "docs/zoo.md": "test_zoo_docs.py",
+    "docs/serve.md": "test_web_api.py",
     "docs/foreign_environments.md": "test_masked_attention_in_sb3.py",
 }
 PAGES = sorted(

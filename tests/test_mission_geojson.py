@@ -77,10 +77,10 @@ def test_names(given_feature, name):
     assert read(given_feature).ids == (name,)
 
 
-def test_third_coordinates_are_altitudes_and_a_note_says_so():
+def test_third_coordinates_are_not_flown_and_a_note_says_so():
     tasks = read(collection(feature(8, 47, 30.5), feature(8, 48, 0), feature(8, 49, 400, alt=25)))
-    assert tasks.altitudes.tolist() == pytest.approx([30.5, np.nan, 25], nan_ok=True)
-    assert "above the depot" in tasks.notes[0]
+    assert tasks.altitudes.tolist() == pytest.approx([np.nan, np.nan, 25], nan_ok=True)
+    assert "not flown" in tasks.notes[0]
     assert read(collection(feature(8, 48, 0), feature(8, 49, 400, alt=25))).notes == ()
 
 

@@ -20,19 +20,19 @@ def test_what_fits_stays():
 
 
 @pytest.mark.parametrize(
-    ("fields", "left"),
+    ("fields", "reach", "left"),
     [
         # Both are worth the same; the one far away takes more of the range.
-        ({"values": [1.0, 1.0, 1.0]}, [0, 1]),
+        ({"values": [1.0, 1.0, 1.0]}, 10.0, [0, 1]),
         # Five times the value for about four times the range.
-        ({"values": [1.0, 1.0, 20.0]}, [2]),
-        ({"values": [1.0, 1.0, 1.0], "must_serve": [False, False, True]}, [2]),
+        ({"values": [1.0, 1.0, 20.0]}, 10.0, [2]),
+        ({"values": [1.0, 1.0, 1.0], "must_serve": [False, False, True]}, 10.0, [2]),
         # Service takes range too.
-        ({"values": [1.0, 1.0, 1.0], "service": [0.0, 9.0, 0.0]}, [0]),
+        ({"values": [1.0, 1.0, 1.0], "service": [0.0, 9.0, 0.0]}, 13.0, [0, 2]),
     ],
 )
-def test_what_is_worth_least_for_its_range_goes_first(fields, left):
-    instance, old = old_routes([(-1.0, 0.0), (-1.0, 1.0), (5.0, 0.0)], [[0, 1, 2]], 10.0, **fields)
+def test_what_is_worth_least_for_its_range_goes_first(fields, reach, left):
+    instance, old = old_routes([(-1.0, 0.0), (-1.0, 1.0), (5.0, 0.0)], [[0, 1, 2]], reach, **fields)
     assert old.fitting() == Schedule([left])
     check_schedule(instance, 0, old.fitting())
 

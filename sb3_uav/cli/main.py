@@ -29,6 +29,7 @@ _FORWARDED = {
     "anytime": ("sb3_uav.cli.anytime:main", "draw objective against time from an evaluation"),
     "reproduce": ("sb3_uav.cli.reproduce:main", "make the tables and figures of the paper"),
     "compare": ("sb3_uav.cli.compare:main", "train algorithms at an equal budget and compare them"),
+    "serve": ("sb3_uav.cli.serve:main", "plan missions in a browser, and by a JSON API"),
     "demo": ("sb3_uav.cli.demo:main", "train and evaluate a small scenario in a few minutes"),
 }
 

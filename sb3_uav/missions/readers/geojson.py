@@ -20,8 +20,8 @@ from sb3_uav.missions.writers.geojson_routes import PLANE_MEMBER
 _CRS84 = frozenset({"urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "OGC:CRS84"})
 _ALTITUDE_NAMES = ("alt", "altitude", "altitude_m")
 _HEIGHTS = (
-    "Altitudes are the third coordinates of the file, taken for meters above the depot; check whether they are heights above "
-    "the sea or the ellipsoid."
+    "The third coordinates of the file are heights above the ellipsoid and are not flown; a property alt gives a task an "
+    "altitude in meters above the depot."
 )
 
 
@@ -31,9 +31,9 @@ def read_geojson(data: bytes, source: str) -> TaskList:
 
     Properties, in any case of letters: ``id`` or ``name`` (or else the ``id`` of the feature, or its number), ``value`` or
     ``priority`` (1 by default), ``service_s`` (0), ``must`` (false), and ``alt``, ``altitude`` or ``altitude_m``, meters above
-    the depot. The third coordinate is the altitude of a task that has no such property; 0 stands for none, because many
-    systems write it everywhere. The RFC calls it a height above the ellipsoid, so that a note says how it is taken. At most
-    one feature has ``"depot": true``. Other properties and bounding boxes are not looked at.
+    the depot. A third coordinate is a height above the ellipsoid (RFC 7946, section 3.1.1), often that of the ground, so it is
+    no altitude to fly at; a note says that it is not used. At most one feature has ``"depot": true``. Other properties and
+    bounding boxes are not looked at.
 
     Anything but a Point is refused, a MultiPoint too, whose points have no names. So is any coordinate reference system but
     longitude and latitude on WGS84 (CRS84). A collection with the member ``sb3_uav_plane``, as
@@ -61,8 +61,7 @@ def read_geojson(data: bytes, source: str) -> TaskList:
             depot = point
             continue
         altitude = _first(properties, _ALTITUDE_NAMES)
-        if altitude is None and len(position) == 3 and position[2] != 0:
-            altitude, has_heights = position[2], True
+        has_heights |= altitude is None and len(position) == 3 and position[2] != 0
         rows.append(
             {
                 "id": _id_of(feature, properties, number, where),
