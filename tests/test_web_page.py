@@ -138,6 +138,35 @@ def test_by_clicks_on_the_map(server: Served, browser: Any):
         assert page.locator("#tasks-summary").inner_text().startswith("2 tasks")
 
 
+def test_across_the_antimeridian(server: Served, browser: Any):
+    with visit_in(browser) as visit:
+        page = opened(visit, server)
+        drop(page, "field.csv", "id,lat,lon,depot\nbase,-17,179.99,yes\nwest,-17,179.98,\neast,-17.001,-179.99,\n")
+        page.get_by_text("2 tasks").wait_for()
+        west, east = (
+            page.evaluate("(id) => document.getElementById('map').mission.pixelOfTask(id)", id) for id in ("west", "east")
+        )
+        # 0.03 degrees, over most of the width of the map.
+        assert 500 < east[0] - west[0] < 1000
+        page.click("#add")
+        click_map(page, east[0] - 40, east[1] - 100)
+        page.keyboard.press("Escape")
+        plan(page, "0.2")
+        assert page.locator("#figures").inner_text().split("\n")[1] == "3 of 3"
+        click_task(page, "t3")
+        longitude = float(page.locator("#details input").nth(3).input_value())
+        assert -180 < longitude < -179.99
+        # A fleet, dropped too.
+        drop(page, "my fleet.csv", "id,range_m\nkestrel,9000\nheron,5000\n")
+        page.get_by_label("Name").nth(1).wait_for()
+        assert [page.get_by_label("Name").nth(row).input_value() for row in range(2)] == ["kestrel", "heron"]
+        # What nothing brings back is asked for twice.
+        page.click("#clear")
+        assert "3 tasks" in page.locator("#tasks-summary").inner_text()
+        page.click("#clear")
+        assert page.locator("#tasks-summary").inner_text() == "No tasks yet."
+
+
 @pytest.mark.slow
 def test_a_second_browser_waits_in_the_queue(server: Served, browser: Any):
     with visit_in(browser) as first, visit_in(browser) as second:

@@ -59,8 +59,8 @@ class Rooms:
     def __init__(self, limits: Limits, tiles: str | None = None) -> None:
         self.limits, self.tiles = limits, tiles
         self.solves = Pool(limits.max_solves, limits.max_waiting, limits.max_kept, "solves")
-        # Files are read and written apart from solves, so that neither waits for the other.
-        self.desk = Pool(1, 16, 1, "files")
+        # Files are read and written apart from solves, so that neither waits for the other; a large zip takes seconds.
+        self.desk = Pool(2, 16, 2, "files")
 
     def open(self) -> None:
         """Start the processes."""

@@ -1,8 +1,9 @@
 """
 Processes that work for the server: started ahead, stopped at any moment, replaced at once.
 
-They are forked from a server process that has imported everything and loaded the networks (see
-https://docs.python.org/3/library/multiprocessing.html#contexts-and-start-methods), so a new one is ready within a moment.
+On Linux they are forked from a server process that has imported everything and loaded the networks (see
+https://docs.python.org/3/library/multiprocessing.html#contexts-and-start-methods), so a new one is ready within a
+moment; elsewhere it takes some seconds.
 Messages are JSON, followed by as many blocks of bytes as they announce; nothing is pickled after the start.
 """
 
@@ -64,7 +65,8 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        if "forkserver" in multiprocessing.get_all_start_methods():
+        # Not on macOS, whose libraries do not survive a fork.
+        if sys.platform == "linux":
             context: Any = multiprocessing.get_context("forkserver")
             context.set_forkserver_preload([PRELOADED])
         else:

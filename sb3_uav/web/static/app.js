@@ -373,13 +373,25 @@ for (const type of ["dragover", "dragleave", "drop"]) {
   document.addEventListener(type, (event) => {
     event.preventDefault();
     document.body.classList.toggle("dragging", type === "dragover");
-    if (type === "drop") takeFile(event.dataTransfer.files[0]);
+    const file = type === "drop" ? event.dataTransfer.files[0] : undefined;
+    if (file && /fleet[^/]*\.csv$/i.test(file.name)) takeFleet(file);
+    else takeFile(file);
   });
 }
 $("add").addEventListener("click", () => setMode("add"));
 $("depot").addEventListener("click", () => setMode("depot"));
 $("example").addEventListener("click", example);
-$("clear").addEventListener("click", clear);
+// Asked for twice, because nothing brings it back.
+$("clear").addEventListener("click", () => {
+  const isSure = $("clear").dataset.asked === "yes";
+  $("clear").dataset.asked = isSure ? "" : "yes";
+  $("clear").textContent = isSure ? "Clear all" : "Really clear all?";
+  if (isSure) clear();
+});
+$("clear").addEventListener("blur", () => {
+  $("clear").dataset.asked = "";
+  $("clear").textContent = "Clear all";
+});
 $("system").addEventListener("change", () => {
   state.tasks = emptyTasks();
   changed();
