@@ -54,6 +54,7 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
                 "end": None if uav.end is None else list(uav.end),
                 "reserve_percent": uav.reserve_percent,
                 "full_range_m": uav.full_range_m,
+                "level": uav.level,
             }
             for uav in plan.fleet
         ],
@@ -103,6 +104,7 @@ def plan_from_json(data: Any, source: str) -> Plan:
                 _point(uav["end"]),
                 float(uav["reserve_percent"]),
                 None if uav.get("full_range_m") is None else float(uav["full_range_m"]),
+                None if uav.get("level") is None else int(uav["level"]),
             )
             for uav in data["fleet"]
         ]
@@ -110,6 +112,7 @@ def plan_from_json(data: Any, source: str) -> Plan:
         schedule = Schedule([[number[str(name)] for name in route] for route in data["routes"]])
         past = data.get("past") or {}
         past_tasks, past_uavs = (tuple(str(name) for name in past.get(kind) or ()) for kind in ("tasks", "uavs"))
+        bound = None if data.get("bound") is None else float(data["bound"])
         solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
     except (AttributeError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
@@ -119,7 +122,9 @@ def plan_from_json(data: Any, source: str) -> Plan:
         if len(set(names)) < len(names):
             raise ValueError(f"{source}: two {what} have the same name; give each its own.")
     plan = make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
-    return replace(plan, past_tasks=past_tasks, past_uavs=past_uavs)
+    if bound is not None and not plan.objective <= bound < np.inf:
+        raise ValueError(f"{source}: bound is {bound:g}, but it is finite and at least {plan.objective:g}, the objective.")
+    return replace(plan, bound=bound, past_tasks=past_tasks, past_uavs=past_uavs)
 
 
 def _point(given: Any) -> tuple[float, float] | None:
