@@ -74,6 +74,24 @@ def test_a_solved_plan_survives_its_file(tmp_path):
     assert (read.objective, read.length_m, read.skipped) == (plan.objective, plan.length_m, plan.skipped)
 
 
+@pytest.mark.parametrize(
+    ("change", "fleet", "time_limit", "message"),
+    [
+        ({"points": np.array([[147.0, 8.0]])}, Fleet.of_equal(1, 3e3), 1.0, "task 1: lat is 147"),
+        ({"ids": ("a\n",)}, Fleet.of_equal(1, 3e3), 1.0, "task 1: id is 'a\\n'"),
+        ({}, Fleet((Uav("a", 3e3), Uav("a", 3e3))), 1.0, "UAV 2: id 'a' is that of UAV 1 too"),
+        ({}, Fleet.of_equal(1, 3e3, reserve_percent=-20), 1.0, "UAV 1: the reserve is -20 %"),
+        ({}, Fleet.of_equal(1, 3e3), 0.0, "time_limit is 0; give a number of seconds above 0"),
+        ({}, Fleet.of_equal(1, 3e3), np.nan, "time_limit is nan; give a number of seconds above 0"),
+    ],
+)
+def test_what_no_reader_has_checked_is_checked(change, fleet, time_limit, message):
+    tasks = replace(tasks_at((47.01, 8.0)), **change)
+    with pytest.raises(ValueError) as error:
+        solve(tasks, fleet, "greedy-insertion", time_limit)
+    assert message in str(error.value)
+
+
 def test_better_plans_are_told_as_they_come():
     pytest.importorskip("numba")
     points = np.array([47.0, 8.0]) + np.random.default_rng(2).uniform(-0.05, 0.05, (60, 2))
@@ -84,6 +102,14 @@ def test_better_plans_are_told_as_they_come():
     ranks = [(found.objective, -found.length_m) for found in told]
     assert ranks == sorted(ranks)
     assert (plan.objective, -plan.length_m) >= ranks[-1]
+
+
+def test_a_plan_of_uavs_in_the_air_survives_its_file(tmp_path):
+    """One has flown all it can, one has nothing left but its reserve."""
+    fleet = Fleet((Uav("a", 0.0, full_range_m=5e3), Uav("b", 400.0, reserve_percent=100.0), Uav("c", 3_000.0)))
+    plan = make_plan(tasks_at((47.01, 8.0)), fleet, Schedule([[], [], [0]]), "by hand")
+    save_plan(plan, tmp_path / "mission.json")
+    assert load_plan(tmp_path / "mission.json").fleet.uavs == fleet.uavs
 
 
 def test_a_plan_keeps_its_bound_and_altitudes_and_refuses_a_wrong_bound(tmp_path):

@@ -237,6 +237,8 @@ def test_a_status_file_may_grow():
         (Status(tasks=(NewTask("n", (1.0, 1.0)),) * 2), "task n: task n is named twice"),
         (Status(tasks=(NewTask("n", (1.0, 1.0), -1.0),)), "task n: value is -1"),
         (Status(tasks=(NewTask("n", (1.0, 1.0), 1.0, math.inf),)), "task n: service_s is inf"),
+        (Status(tasks=(NewTask("n", (1.0, 1.0), altitude_m=-5e3),)), "task n: alt_m is -5000"),
+        (Status(tasks=(NewTask("n\x1b[31m", (1.0, 1.0)),)), "with a control character; remove it"),
         (
             Status(tasks=(NewTask("n", (1.0, 1.0)),), system="wgs84"),
             "coordinates are lat and lon, but those of the plan are x",

@@ -122,11 +122,40 @@ def test_errors_write_nothing(mission, capsys, status, arguments, message):
         ("fleet", None, "TypeError"),
         ("past", [1], "AttributeError"),
         ("routes", [["n1"], ["n3"]], "KeyError 'n3'"),
+        ("routes", [["n1", "n1"], []], "is visited twice"),
+        ("seconds", "soon", "could not convert string to float"),
+        ("depot", None, "the plan has no depot"),
+        ("fleet", [], "there are 0 UAVs"),
     ],
 )
 def test_a_changed_plan_is_an_error(mission, capsys, field, value, message):
     path = mission / "mission.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), field: value}))
+    assert replan("lost,north\n", "mission") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("sb3-uav replan: error: mission/mission.json: ") and error.count("\n") == 1
+    assert message in error
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value", "message"),
+    [
+        ("fleet", "reserve_percent", -300, "UAV 1: the reserve is -300 %"),
+        ("fleet", "range_m", -1, "UAV 1: the range is -1 m"),
+        ("fleet", "full_range_m", 0, "UAV 1: the full range is 0 m"),
+        ("fleet", "speed_mps", 0, "UAV 1: the speed is 0 m/s"),
+        ("fleet", "level", -4, "UAV 1: the level is -4"),
+        ("tasks", "must", "no", "'no' is neither true nor false"),
+        ("tasks", "value", float("nan"), "task 1: value is nan"),
+        ("tasks", "point", [147.0, 8.0], "task 1: lat is 147"),
+        ("tasks", "altitude_m", 1e6, "task 1: alt_m is 1000000"),
+    ],
+)
+def test_a_plan_whose_parts_cannot_be_is_an_error(mission, capsys, part, field, value, message):
+    path = mission / "mission.json"
+    data = json.loads(path.read_text())
+    data[part][0][field] = value
+    path.write_text(json.dumps(data))
     assert replan("lost,north\n", "mission") == 2
     error = capsys.readouterr().err
     assert error.startswith("sb3-uav replan: error: mission/mission.json: ") and error.count("\n") == 1

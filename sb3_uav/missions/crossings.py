@@ -48,6 +48,12 @@ class _Legs:
     b: np.ndarray
     sites: np.ndarray
 
+    @property
+    def altitudes(self) -> tuple[float, float]:
+        """The lowest and the highest, in meters; both infinite, and the wrong way round, without legs."""
+        both = np.concatenate([self.a[:, 2], self.b[:, 2]])
+        return float(both.min(initial=np.inf)), float(both.max(initial=-np.inf))
+
     @classmethod
     def of(cls, plan: Plan, uav: int, route: Route, flight: FlightOptions) -> _Legs:
         """
@@ -78,7 +84,11 @@ def find_crossings(plan: Plan, flight: FlightOptions) -> list[Crossing]:
     numbers = [np.flatnonzero(route.legs_m > 0) for route in plan.routes]
     coordinates = plan.tasks.coordinates()
     found = []
-    for u, v in itertools.combinations(range(len(flown)), 2):
+    # Most pairs of UAVs never come to one altitude, and there may be many pairs.
+    heights = [legs.altitudes for legs in flown]
+    for u, v in itertools.combinations([uav for uav, legs in enumerate(flown) if len(legs.a)], 2):
+        if max(heights[u][0], heights[v][0]) - min(heights[u][1], heights[v][1]) >= SEPARATION_M:
+            continue
         for begin in range(0, len(flown[u].a), _BLOCK):
             block = _Legs(flown[u].a[begin : begin + _BLOCK], flown[u].b[begin : begin + _BLOCK], flown[u].sites)
             for i, j, point in _pairs(block, flown[v]):

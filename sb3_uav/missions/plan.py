@@ -37,12 +37,12 @@ class Route:
 
     @property
     def length_m(self) -> float:
-        """Metres flown."""
+        """Meters flown."""
         return math.fsum(self.legs_m)
 
     @property
     def used_m(self) -> float:
-        """Metres of the range that are used, with the service of the stops."""
+        """Meters of the range that are used, with the service of the stops."""
         return self.length_m + self.service_m
 
     @property
@@ -121,7 +121,7 @@ class Plan:
 
     @property
     def length_m(self) -> float:
-        """Metres flown by all UAVs."""
+        """Meters flown by all UAVs."""
         return math.fsum(route.length_m for route in self.routes)
 
     def _repr_html_(self) -> str:

@@ -10,10 +10,11 @@ from typing import Any, get_args
 import numpy as np
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.envs.schedule import Schedule
+from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
 from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.plan import Plan
+from sb3_uav.missions.readers.checks import check_fleet, check_tasks
 from sb3_uav.missions.search import make_plan
 from sb3_uav.missions.tasks import TaskList
 
@@ -87,7 +88,7 @@ def plan_from_json(data: Any, source: str) -> Plan:
             data["system"],
             [task["value"] for task in data["tasks"]],
             [task["service_s"] for task in data["tasks"]],
-            [task["must"] for task in data["tasks"]],
+            [_flag(task["must"]) for task in data["tasks"]],
             depot=data["depot"],
             altitudes=np.array(
                 [np.nan if task["altitude_m"] is None else task["altitude_m"] for task in data["tasks"]], float
@@ -114,14 +115,23 @@ def plan_from_json(data: Any, source: str) -> Plan:
         past_tasks, past_uavs = (tuple(str(name) for name in past.get(kind) or ()) for kind in ("tasks", "uavs"))
         bound = None if data.get("bound") is None else float(data["bound"])
         solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
-    except (AttributeError, KeyError, TypeError, IndexError, OverflowError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
-    if tasks.system == "wgs84" and tasks.depot is not None and not (np.abs(tasks.depot) <= (90.0, 180.0)).all():
+    if tasks.depot is None:
+        raise ValueError(f"{source}: the plan has no depot; plan anew.")
+    if tasks.system == "wgs84" and not (np.abs(tasks.depot) <= (90.0, 180.0)).all():
         raise ValueError(f"{source}: depot is {tasks.depot.tolist()}; give latitude and longitude in degrees.")
     for what, names in (("tasks", tasks.ids), ("UAVs", tuple(uav.id for uav in uavs))):
         if len(set(names)) < len(names):
             raise ValueError(f"{source}: two {what} have the same name; give each its own.")
-    plan = make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
+    fleet = Fleet(tuple(uavs), source)
+    check_tasks(replace(tasks, source=source), allow_duplicates=True)
+    # Of a mission that was planned again: its UAVs may be in the air.
+    check_fleet(fleet, is_flying=True)
+    try:
+        plan = make_plan(tasks, fleet, schedule, solver, seed, seconds)
+    except InfeasibleScheduleError as error:
+        raise InfeasibleScheduleError(f"{source}: {error}") from error
     if bound is not None and not plan.objective <= bound < np.inf:
         raise ValueError(f"{source}: bound is {bound:g}, but it is finite and at least {plan.objective:g}, the objective.")
     return replace(plan, bound=bound, past_tasks=past_tasks, past_uavs=past_uavs)
@@ -129,6 +139,12 @@ def plan_from_json(data: Any, source: str) -> Plan:
 
 def _point(given: Any) -> tuple[float, float] | None:
     return None if given is None else (float(given[0]), float(given[1]))
+
+
+def _flag(given: Any) -> bool:
+    if not isinstance(given, bool):
+        raise TypeError(f"{given!r:.40} is neither true nor false")
+    return given
 
 
 def save_plan(plan: Plan, path: Path) -> None:

@@ -19,7 +19,7 @@ def service_speed(tasks: TaskList, fleet: Fleet) -> float:
 
     :param tasks: The tasks
     :param fleet: The UAVs
-    :return: Metres per second; 0 if no task takes time
+    :return: Meters per second; 0 if no task takes time
     :raises ValueError: If a task takes time and the speed of a UAV is not known
     """
     if not (tasks.service_s > 0).any():

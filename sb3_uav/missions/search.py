@@ -15,7 +15,7 @@ from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.leftovers import skipped_tasks
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.problem import make_instance, service_speed
-from sb3_uav.missions.readers.checks import check_fits
+from sb3_uav.missions.readers.checks import check_fits, check_fleet, check_tasks
 from sb3_uav.missions.remarks import remarks_on
 from sb3_uav.missions.tasks import TaskList
 
@@ -64,6 +64,11 @@ def solve(
     fleet = tasks.fleet if fleet is None else fleet
     if fleet is None:
         raise ValueError(f"{tasks.source}: nothing says which UAVs there are; give a fleet.")
+    if not 0 < time_limit < math.inf:
+        raise ValueError(f"time_limit is {time_limit:g}; give a number of seconds above 0.")
+    # Neither need come from a file whose reader has seen to it. UAVs may be in the air.
+    check_tasks(tasks, allow_duplicates=True)
+    check_fleet(fleet, is_flying=True)
     check_fits(tasks, fleet)
     instance = make_instance(tasks, fleet)
     chosen = make_solver(solver or default_spec(instance, time_limit), device="cpu")

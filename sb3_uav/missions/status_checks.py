@@ -10,7 +10,9 @@ import numpy as np
 
 from sb3_uav.missions.fleet import Uav
 from sb3_uav.missions.plan import Plan
+from sb3_uav.missions.readers.checks import check_tasks
 from sb3_uav.missions.status import NewTask, Status, UavReport
+from sb3_uav.missions.tasks import TaskList
 
 # Nobody is so many times farther from the depot than UAVs fly, and so many meters.
 _FAR_RANGES, _FAR_M = 20.0, 100_000.0
@@ -78,6 +80,24 @@ class _Checks:
             self._report(report)
         for task in status.tasks:
             self._new_task(task)
+        if status.tasks:
+            check_tasks(self._new_tasks(), allow_duplicates=True)
+
+    def _new_tasks(self) -> TaskList:
+        """:return: The new tasks as a list of their own, to be checked as those of any other file"""
+        old, status, new = self._plan.tasks, self._status, self._status.tasks
+        return TaskList.of(
+            [task.id for task in new],
+            [task.point for task in new],
+            old.system,
+            [task.value for task in new],
+            [task.service_s for task in new],
+            [task.must for task in new],
+            altitudes=np.array([task.altitude_m for task in new], float),
+            meters_per_unit=old.meters_per_unit,
+            places=tuple(status.places.get(("task", task.id), f"task {task.id}") for task in new),
+            source=status.source,
+        )
 
     def _names(self, kind: str, what: str, names: Iterable[str], known: Collection[str]) -> None:
         seen: set[str] = set()
@@ -125,9 +145,6 @@ class _Checks:
     def _new_task(self, task: NewTask) -> None:
         plan, status, place = self._plan, self._status, self._status.place("task", task.id)
         self._point(place, task.point)
-        for name, number in (("value", task.value), ("service_s", task.service_s)):
-            if not 0 <= number < math.inf:
-                raise ValueError(f"{place}: {name} is {number:g}; give a finite number, 0 or more.")
         if task.id in self._tasks:
             tasks, old = plan.tasks, self._tasks[task.id]
             was = (*tasks.points[old], tasks.values[old], tasks.service_s[old], tasks.must[old])

@@ -160,17 +160,18 @@ def check_fleet_size(n_uavs: int, source: str = "fleet") -> None:
         raise ValueError(f"{source}: there are {n_uavs} UAVs; give at least 1, and {MAX_FLEET} at most.")
 
 
-def check_fleet(fleet: Fleet, places: Sequence[str] = ()) -> None:
+def check_fleet(fleet: Fleet, places: Sequence[str] = (), is_flying: bool = False) -> None:
     """
     :param fleet: UAVs from a file or from options
     :param places: Where in the file every one stands, for errors
+    :param is_flying: Whether they may be in the air, with no range left, or nothing but their reserve
     :raises ValueError: If there are none or too many, a name is doubled, or a range, a speed, a reserve or a place is not
         allowed; the message names the UAV and what was found
     """
     check_fleet_size(len(fleet), fleet.source)
     places = places or [f"UAV {number}" for number in range(1, len(fleet) + 1)]
     for uav, place in zip(fleet, places, strict=True):
-        wrong = next(_wrong_with(uav), None)
+        wrong = next(_wrong_with(uav, is_flying), None)
         if wrong is not None:
             raise ValueError(f"{fleet.source}: {place}: {wrong}")
     check_names([uav.id for uav in fleet], places, fleet.source)
@@ -200,13 +201,17 @@ def check_fits(tasks: TaskList, fleet: Fleet) -> None:
                 )
 
 
-def _wrong_with(uav: Uav) -> Iterator[str]:
+def _wrong_with(uav: Uav, is_flying: bool) -> Iterator[str]:
     """:return: What is wrong with a UAV"""
-    if not 0 < uav.range_m <= _MOST_METERS:
+    if not (0 < uav.range_m <= _MOST_METERS or (is_flying and uav.range_m == 0)):
         yield f"the range is {_text(uav.range_m)} m; give one above 0, and {_MOST_METERS:g} m at most."
     if uav.speed_mps is not None and not 0 < uav.speed_mps <= _MOST_SPEED:
         yield f"the speed is {_text(uav.speed_mps)} m/s; give one above 0, and {_MOST_SPEED:g} m/s at most."
-    if not 0 <= uav.reserve_percent < 100:
+    if uav.full_range_m is not None and not 0 < uav.full_range_m <= _MOST_METERS:
+        yield f"the full range is {_text(uav.full_range_m)} m; give one above 0, and {_MOST_METERS:g} m at most."
+    if uav.level is not None and not 0 <= uav.level < MAX_FLEET:
+        yield f"the level is {uav.level}; give a whole number from 0 to below {MAX_FLEET}."
+    if not (0 <= uav.reserve_percent < 100 or (is_flying and uav.reserve_percent == 100)):
         yield f"the reserve is {_text(uav.reserve_percent)} %; give a percentage from 0 to below 100."
     for name, point in (("start", uav.start), ("end", uav.end)):
         if point is not None and not all(abs(number) <= _MOST_METERS for number in point):
