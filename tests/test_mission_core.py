@@ -74,6 +74,26 @@ def test_a_solved_plan_survives_its_file(tmp_path):
     assert (read.objective, read.length_m, read.skipped) == (plan.objective, plan.length_m, plan.skipped)
 
 
+def test_what_left_tasks_lack_is_the_shortest_way_round_them(monkeypatch):
+    """Many tasks are compared in blocks."""
+    tasks = tasks_at(*np.array([47.0, 8.0]) + np.random.default_rng(3).uniform(-0.01, 0.01, (11, 2)))
+
+    def used(stops):
+        return make_plan(tasks, Fleet.of_equal(1, 1e5), Schedule([stops]), "by hand").routes[0].used_m
+
+    range_m = max(used([0, 1, 2]), *(used([task]) for task in range(3, 11))) + 1
+    expected = [
+        max(min(used(stops) for stops in ([task, 0, 1, 2], [0, task, 1, 2], [0, 1, task, 2], [0, 1, 2, task])) - range_m, 0)
+        for task in range(3, 11)
+    ]
+    assert max(expected) > 100
+    for size in (512, 3):
+        monkeypatch.setattr("sb3_uav.missions.leftovers._BLOCK", size)
+        skipped = make_plan(tasks, Fleet.of_equal(1, range_m), Schedule([[0, 1, 2]]), "by hand").skipped
+        assert [each.task for each in skipped] == list(range(3, 11))
+        assert [each.missing_m for each in skipped] == pytest.approx(expected, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("change", "fleet", "time_limit", "message"),
     [

@@ -80,7 +80,9 @@ def test_legs_on_one_line() -> None:
 
 def test_a_uav_on_the_ground_crosses_nothing() -> None:
     fleet = Fleet((Uav("a", 1e6), Uav("weak", 10.0, start=(50, -50), end=(50, 50))))
-    assert crossing_legs(plan_of([(100, 0)], [[0], []], fleet)) == []
+    plan = plan_of([(100, 0)], [[0], []], fleet)
+    assert crossing_legs(plan) == []
+    assert "Without a route, because the place where it has to land is out of its reach: weak." in remarks_on(plan)
 
 
 @given(st.lists(st.tuples(st.integers(-50, 50), st.integers(-50, 50)), min_size=4, max_size=9, unique=True), st.integers(0, 3))
@@ -114,6 +116,23 @@ def test_launch_order_is_longest_in_the_air_first() -> None:
     ]
     # From places of their own, nobody waits.
     assert launches(plan_of(points[:2], [[0], [1]], Fleet((Uav("a", 1e6), Uav("b", 1e6, start=(5, 5)))))) == []
+
+
+def test_places_of_launches_are_told_apart() -> None:
+    """Bases a few meters from each other, in degrees."""
+    starts = [(47.123456, 8.123456), (47.123466, 8.123456)]
+    fleet = Fleet(tuple(Uav(f"u{number}", 1e6, start=starts[number % 2]) for number in range(4)))
+    tasks = TaskList.of("abcd", [(47.13, 8.12 + 0.001 * number) for number in range(4)], "wgs84", depot=starts[0])
+    plan = make_plan(tasks, fleet, Schedule([[0], [1], [2], [3]]), "by hand")
+    places = [remark.partition(" at ")[2].partition(", the ")[0] for remark in launches(plan)]
+    assert places == ["lat 47.1234560, lon 8.1234560", "lat 47.1234660, lon 8.1234560"]
+
+
+def test_a_stop_at_the_depot_is_a_flight_too() -> None:
+    """Straight up and down: it needs its turn, and may be too high."""
+    plan = plan_of([(0, 0), (100, 0)], [[0], [1]])
+    assert launches(plan) == ["Launch one after the other, the longest route first: uav-2, uav-1."]
+    assert any("Above 120 m" in remark and "uav-1" in remark for remark in remarks_on(plan, FlightOptions(130.0)))
 
 
 def launches(plan: Plan) -> list[str]:

@@ -12,7 +12,6 @@ from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.labels import (
     count,
     escaped,
-    flies,
     headline,
     ink_on,
     meters,
@@ -52,7 +51,7 @@ def plan_html(plan: Plan) -> str:
         look = uav_look(uav)
         lines.append(view.line(corners, uav_color(uav), look.dash_array))
         for row, does in ((0, "starts"), (-1, "ends")):
-            if np.any(corners[row]) and flies(route):
+            if np.any(corners[row]) and route.flies:
                 marks.append(view.site(corners[row], uav_color(uav), f"{route.uav.id} {does} here"))
         for place, (stop, point) in enumerate(zip(route.stops, corners[1:-1], strict=False), 1):
             must = bool(plan.tasks.must[stop])

@@ -128,14 +128,9 @@ def why_skipped(skipped: Skipped) -> str:
     return f"{skipped.reason}: {missing} of range missing"
 
 
-def flies(route: Route) -> bool:
-    """:return: Whether a UAV leaves the ground"""
-    return bool(route.stops) or route.length_m > 0
-
-
 def route_facts(route: Route) -> str:
     """:return: Stops, length and share of the range of a route, in short"""
-    if not flies(route):
+    if not route.flies:
         return "stays on the ground"
     return f"{count(len(route.stops), 'stop')}, {meters(route.length_m)}, {percent(route.share_of_range)} of range"
 

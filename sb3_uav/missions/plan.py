@@ -36,6 +36,11 @@ class Route:
     service_s: float = 0.0
 
     @property
+    def flies(self) -> bool:
+        """Whether the UAV leaves its place: it has stops, or it has to get to where it lands."""
+        return bool(self.stops) or self.length_m > 0
+
+    @property
     def length_m(self) -> float:
         """Meters flown."""
         return math.fsum(self.legs_m)

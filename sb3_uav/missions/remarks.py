@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_uav.missions.crossings import SEPARATION_M, find_crossings
 from sb3_uav.missions.flight import FlightOptions
-from sb3_uav.missions.labels import shown
+from sb3_uav.missions.labels import position, shown
 from sb3_uav.missions.plan import Plan
 
 REVIEW = "A person must review this plan before it is flown. Wind, terrain, obstacles and no-fly zones are not modeled."
@@ -55,6 +55,9 @@ def _of_fleet(plan: Plan) -> list[str]:
     without = [uav.id for uav in plan.fleet if uav.reserve_percent == 0]
     if without:
         remarks.append(f"No reserve is kept ({named(without)}); --reserve PERCENT keeps a part of the range.")
+    grounded = [route.uav.id for route in plan.routes if not route.flies and (route.points[0] != route.points[-1]).any()]
+    if grounded:
+        remarks.append(f"Without a route, because the place where it has to land is out of its reach: {named(grounded)}.")
     speeds = {uav.speed_mps for uav in plan.fleet if uav.speed_mps is not None}
     if len(speeds) > 1 and (plan.tasks.service_s > 0).any():
         remarks.append(
@@ -90,7 +93,7 @@ def _of_launches(plan: Plan) -> list[str]:
     """Who takes off first, where several start at one place."""
     at_place: dict[tuple[float, ...], list[int]] = defaultdict(list)
     for number, route in enumerate(plan.routes):
-        if route.length_m > 0:
+        if route.flies:
             at_place[tuple(route.points[0])].append(number)
     remarks = []
     for uavs in at_place.values():
@@ -102,7 +105,7 @@ def _of_launches(plan: Plan) -> list[str]:
         order = ", ".join(shown(route.uav.id) for route in longest_first[: 2 * _MAX_NAMED])
         more = len(routes) - 2 * _MAX_NAMED
         measure = "longest time in the air" if is_timed else "longest route"
-        place = "" if len(at_place) == 1 else f" at {', '.join(f'{x:g}' for x in routes[0].points[0])}"
+        place = "" if len(at_place) == 1 else f" at {position(plan.tasks.system, routes[0].points[0])}"
         remarks.append(
             f"Launch one after the other{place}, the {measure} first: {order}"
             f"{f' and {more} more by the length of their routes' if more > 0 else ''}."
@@ -128,7 +131,7 @@ def _of_crossings(plan: Plan, flight: FlightOptions) -> list[str]:
 def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
     high = []
     for number, route in enumerate(plan.routes):
-        if route.length_m > 0:
+        if route.flies:
             wanted = plan.tasks.altitudes[list(route.stops)]
             if np.nanmax(np.array([flight.altitude_of(plan.fleet.level_of(number)), *wanted])) > _HIGH_M:
                 high.append(route.uav.id)
@@ -142,7 +145,7 @@ def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
     Autopilots return at an altitude of their own, where that is higher: see RTL_RETURN_ALT of
     https://docs.px4.io/main/en/flight_modes/return.html and RTL_ALT of https://ardupilot.org/copter/docs/rtl-mode.html.
     """
-    flying = [number for number, route in enumerate(plan.routes) if route.length_m > 0]
+    flying = [number for number, route in enumerate(plan.routes) if route.flies]
     if plan.tasks.system != "wgs84" or flight.landing != "rtl" or len(flying) < 2:
         return []
     name = "RTL_RETURN_ALT" if flight.firmware == "px4" else "RTL_ALT"

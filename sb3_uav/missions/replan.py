@@ -181,7 +181,7 @@ def _legs_of(plan: Plan) -> _Legs:
     """:return: All legs that are flown"""
     legs: _Legs = set()
     for route in plan.routes:
-        if route.length_m > 0:
+        if route.flies:
             legs |= {(route.uav.id, a, b) for a, b in pairwise([None, *(plan.tasks.ids[task] for task in route.stops), None])}
     return legs
 

@@ -17,7 +17,6 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.writers.lines import split_at_antimeridian
-from sb3_uav.missions.writers.mission_items import flies
 
 #: Foreign member (section 6.1 of the RFC) of files whose coordinates are not longitudes and latitudes
 PLANE_MEMBER = "sb3_uav_plane"
@@ -43,7 +42,7 @@ def write_routes_geojson(plan: Plan, path: Path) -> None:
     """
     tasks = plan.tasks
     features = [] if tasks.depot is None else [point_feature(tasks, tasks.depot, {"kind": "depot"})]
-    features += [_route_feature(tasks, route) for route in plan.routes if flies(route)]
+    features += [_route_feature(tasks, route) for route in plan.routes if route.flies]
     for route in plan.routes:
         for number, task in enumerate(route.stops, 1):
             properties = {"kind": "stop", "stop": number, "uav": route.uav.id, **task_properties(tasks, task)}

@@ -15,7 +15,7 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.missions.flight import FlightOptions
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.writers.lines import split_at_antimeridian
-from sb3_uav.missions.writers.mission_items import altitudes_of, check_is_geographic, flies
+from sb3_uav.missions.writers.mission_items import altitudes_of, check_is_geographic
 
 _NAMESPACE = "http://www.opengis.net/kml/2.2"
 # Colors of lines as KML has them: opacity, blue, green, red.
@@ -48,7 +48,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
     if tasks.depot is not None:
         _point(document, "Depot", "", tasks.depot.tolist(), 0.0)
     for uav, route in enumerate(plan.routes):
-        if flies(route):
+        if route.flies:
             _route_folder(document, plan, uav, route, flight)
     if plan.skipped:
         folder = _folder(document, "Skipped tasks")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_uav.missions.labels import count, flies, number, route_facts, shown, uav_color, uav_look
+from sb3_uav.missions.labels import count, number, route_facts, shown, uav_color, uav_look
 from sb3_uav.missions.plan import Plan, Reason, Route
 from sb3_uav.plots.figure_files import checked_path, new_figure, save_figure
 
@@ -137,7 +137,7 @@ def _draw_route(axes: Any, plan: Plan, uav: int, route: Route, path: np.ndarray,
         axes.plot([], [], linestyle="", label=f"{len(plan.routes) - _MAX_NAMED} more UAVs")
     elif uav < _MAX_NAMED:
         axes.plot([], [], **line, marker="o", markersize=4, markerfacecolor=look.fill, label=label)
-    axes.plot(*(path if flies(route) else path[:0]).T, **line, zorder=3)
+    axes.plot(*(path if route.flies else path[:0]).T, **line, zorder=3)
     must = plan.tasks.must[list(route.stops)]
     stops = path[1:-1]
     axes.scatter(*stops[~must].T, s=size, **stop)

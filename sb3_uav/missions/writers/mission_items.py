@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_uav.missions.flight import FlightOptions
-from sb3_uav.missions.plan import Plan, Route
+from sb3_uav.missions.plan import Plan
 from sb3_uav.missions.tasks import TaskList
 
 WAYPOINT, LOITER_TIME, RETURN_TO_LAUNCH, LAND, TAKEOFF, CHANGE_SPEED = 16, 19, 20, 21, 22, 178
@@ -41,11 +41,6 @@ class Item:
     def frame(self) -> int:
         """MAV_FRAME."""
         return NO_POSITION if self.position is None else RELATIVE
-
-
-def flies(route: Route) -> bool:
-    """:return: Whether the UAV leaves its place: it has stops, or it has to get to where it lands"""
-    return bool(route.stops) or route.length_m > 0
 
 
 def check_is_geographic(tasks: TaskList, what: str) -> None:

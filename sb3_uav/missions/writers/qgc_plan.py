@@ -15,7 +15,7 @@ from sb3_uav.common.files import write_atomically
 from sb3_uav.missions.flight import Firmware, FlightOptions, Vehicle
 from sb3_uav.missions.plan import Plan
 from sb3_uav.missions.tasks import TaskList
-from sb3_uav.missions.writers.mission_items import Item, check_is_geographic, flies, home_of, mission_items, task_items
+from sb3_uav.missions.writers.mission_items import Item, check_is_geographic, home_of, mission_items, task_items
 from sb3_uav.missions.writers.names import file_stems
 
 #: MAV_AUTOPILOT and MAV_TYPE of https://mavlink.io/en/messages/common.html
@@ -41,7 +41,7 @@ def write_plan_files(plan: Plan, folder: Path, flight: FlightOptions) -> list[Pa
     check_is_geographic(plan.tasks, "missions of autopilots")
     paths = []
     for uav, (route, stem) in enumerate(zip(plan.routes, file_stems(plan), strict=True)):
-        if not flies(route):
+        if not route.flies:
             continue
         path = folder / f"{stem}.plan"
         content = plan_of_items(home_of(plan, uav), mission_items(plan, uav, flight), flight, route.uav.speed_mps)

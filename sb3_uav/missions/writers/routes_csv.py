@@ -23,7 +23,7 @@ def write_routes_csv(plan: Plan, path: Path) -> None:
     """
     names = plan.tasks.coordinates().names
     columns = ("uav", "stop", "task", *names, "leg_m", "used_m", "value", "service_s", "arrival_s")
-    rows = (row for route in plan.routes if route.length_m > 0 or route.stops for row in _rows(plan, route))
+    rows = (row for route in plan.routes if route.flies for row in _rows(plan, route))
     with replaced_when_complete(path) as file:
         write_csv(file, columns, rows)
 

@@ -17,7 +17,6 @@ from sb3_uav.missions.writers.mission_items import (
     WAYPOINT,
     Item,
     check_is_geographic,
-    flies,
     home_of,
     mission_items,
     task_items,
@@ -41,7 +40,7 @@ def write_wpl_files(plan: Plan, folder: Path, flight: FlightOptions) -> list[Pat
     check_is_geographic(plan.tasks, "missions of autopilots")
     paths = []
     for uav, (route, stem) in enumerate(zip(plan.routes, file_stems(plan), strict=True)):
-        if flies(route):
+        if route.flies:
             path = folder / f"{stem}.waypoints"
             write_atomically(path, wpl_of_items(home_of(plan, uav), mission_items(plan, uav, flight), flight))
             paths.append(path)
