@@ -8,6 +8,7 @@ import pytest
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
 from sb3_uav.missions.coordinates import Geographic
 from sb3_uav.missions.fleet import Fleet, Uav
+from sb3_uav.missions.labels import at_least
 from sb3_uav.missions.plan import Plan
 from sb3_uav.missions.plan_file import load_plan, save_plan
 from sb3_uav.missions.search import make_plan, solve
@@ -92,6 +93,10 @@ def test_what_left_tasks_lack_is_the_shortest_way_round_them(monkeypatch):
         skipped = make_plan(tasks, Fleet.of_equal(1, range_m), Schedule([[0, 1, 2]]), "by hand").skipped
         assert [each.task for each in skipped] == list(range(3, 11))
         assert [each.missing_m for each in skipped] == pytest.approx(expected, abs=0.1)
+
+
+def test_what_is_missing_is_never_rounded_down():
+    assert [at_least(length) for length in (0.2, 1.0, 1.2, 9_999.9, 12_301.0)] == ["1 m", "1 m", "2 m", "10000 m", "12.4 km"]
 
 
 @pytest.mark.parametrize(

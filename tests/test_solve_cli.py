@@ -62,7 +62,7 @@ def test_a_mission(tasks_csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.err == "" and max(map(len, printed.out.splitlines())) <= 80
     text = " ".join(printed.out.split())
     assert text.startswith("3 of 5 tasks served, value 6 of 10,")
-    assert "1 task skipped, out of reach: d (61.0 km short)" in text and "1 task skipped, worth nothing: e" in text
+    assert "1 task skipped, out of reach: d (61.1 km short)" in text and "1 task skipped, worth nothing: e" in text
     assert "A person must review this plan" in text and "bound" not in text and "No reserve" not in text
     assert "Written to out: mission.json," in text and text.endswith("summary.json")
     summary = json.loads(Path("out/summary.json").read_text(encoding="utf-8"))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from sb3_uav.evaluation.table import require_rich
-from sb3_uav.missions.labels import count, meters, number, percent, shown
+from sb3_uav.missions.labels import at_least, count, meters, number, percent, proof, shown
 from sb3_uav.missions.plan import Plan, Reason
 from sb3_uav.missions.remarks import named
 
@@ -43,7 +43,7 @@ def print_plan(plan: Plan, files: Sequence[Path], console: Any = None) -> None:
     tasks = plan.tasks
     write(
         f"{plan.n_served:,} of {count(len(tasks), 'task')} served, value {number(plan.objective)} of "
-        f"{number(float(tasks.values.sum()))}, {meters(plan.length_m)} flown{_proof(plan)}",
+        f"{number(float(tasks.values.sum()))}, {meters(plan.length_m)} flown{'; ' * bool(proof(plan))}{proof(plan)}",
         "bold",
     )
     console.print(_table(rich, plan))
@@ -74,13 +74,7 @@ def why_empty(plan: Plan) -> str:
     name, missing = shown(plan.tasks.ids[best.task]), best.missing_m or 0.0
     if best.reason == "did not fit":
         return f"the solver found no route, though task {name} alone is in reach; give it more time or choose another."
-    return f"all tasks are out of reach; the nearest, {name}, needs {_exactly(missing)} more range than any UAV may use."
-
-
-def _proof(plan: Plan) -> str:
-    if plan.bound is None or plan.gap is None:
-        return ""
-    return f"; proven bound {number(plan.bound)}, gap {100 * max(plan.gap, 0.0):.1f} %"
+    return f"all tasks are out of reach; the nearest, {name}, needs {at_least(missing)} more range than any UAV may use."
 
 
 def _table(rich: Any, plan: Plan) -> Any:
@@ -101,12 +95,7 @@ def _table(rich: Any, plan: Plan) -> Any:
 
 def _missing(plan: Plan, task: int, missing: float | None) -> str:
     name = shown(plan.tasks.ids[task])
-    return name if not missing else f"{name} ({_exactly(missing)} short)"
-
-
-def _exactly(meters: float) -> str:
-    """Rounded up, so that so much more range is enough."""
-    return f"{int(-(-meters // 1))} m" if meters < 10_000 else f"{meters / 1000:.1f} km"
+    return name if not missing else f"{name} ({at_least(missing)} short)"
 
 
 def _time(seconds: float) -> str:

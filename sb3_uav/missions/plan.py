@@ -68,8 +68,8 @@ class Skipped:
 
     :param task: Index of the task
     :param reason: Why
-    :param missing_m: How many more meters of range the UAV would need that is nearest to serving it; None where it does not
-        apply
+    :param missing_m: How many more meters the UAV that is nearest to serving it would have to be allowed to use, see
+        :attr:`~sb3_uav.missions.fleet.Uav.usable_m`; None where it does not apply
     """
 
     task: int
