@@ -44,8 +44,14 @@ def test_a_solve_from_tasks_to_a_zip(server: Served):
     found = server.wait(name)
     assert (found["state"], found["error"], found["place"]) == ("done", None, None)
     assert found["objective"] == found["history"][-1][1] > 0
+    from sb3_uav.web.answers import PlanOut
+
     plan = server.ask("GET", f"/api/v1/solves/{name}/plan").json
     assert plan["mission"]["format"] == "sb3-uav mission"
+    report = PlanOut.model_validate(plan).report.model_dump()
+    # Nothing is undescribed.
+    assert set(report) == set(plan["report"])
+    assert set(report["routes"][0]) == set(plan["report"]["routes"][0])
     report = plan["report"]
     assert report["objective"] == found["objective"]
     assert [route["stops"] for route in report["routes"]] == plan["mission"]["routes"]
@@ -235,11 +241,13 @@ def test_bodies_are_measured_while_they_come_in(server: Served):
 
 def test_requests_of_the_docs(server: Served):
     text = (Path(__file__).parents[1] / "docs" / "serve.md").read_text(encoding="utf-8")
-    commands = [shlex.split(command) for command in re.findall(r"^curl .*?(?=^curl |```)", text, re.MULTILINE | re.DOTALL)]
+    (problem_json,) = re.findall(r"^```json\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    files = {"@problem.json": problem_json.encode(), "@field.csv": b"id,x,y,depot\nd,0,0,yes\na,10,10,\n"}
+    commands = [shlex.split(line) for line in re.findall(r"^curl .*", text, re.MULTILINE)]
     assert len(commands) == 2
     for words in commands:
         (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
-        body = words[words.index("-d") + 1].encode() if "-d" in words else b"id,x,y,depot\nd,0,0,yes\na,10,10,\n"
+        body = files[words[-1]]
         answer = server.ask("POST", url.removeprefix("http://127.0.0.1:8080"), body, {"content-type": "application/json"})
         assert answer.status == 202, answer
         found = server.wait(answer.json["id"], "running", "done", with_plan=True)
