@@ -30,7 +30,7 @@ altitudes = st.just(float("nan")) | st.floats(-1000, 10_000).filter(bool)
 def task_lists(draw: st.DrawFn, system: Any = "wgs84") -> TaskList:
     """Tasks anywhere on earth, with a depot."""
     ids = draw(st.lists(names, min_size=1, max_size=5, unique=True))
-    each = {"min_size": len(ids), "max_size": len(ids)}
+    each: dict[str, Any] = {"min_size": len(ids), "max_size": len(ids)}
     return TaskList.of(
         ids,
         draw(st.lists(places, **each)),
@@ -39,7 +39,7 @@ def task_lists(draw: st.DrawFn, system: Any = "wgs84") -> TaskList:
         draw(st.lists(amounts, **each)),
         draw(st.lists(st.booleans(), **each)),
         depot=draw(places),
-        altitudes=np.array(draw(st.lists(altitudes, **each))),
+        altitudes=np.array(draw(st.lists(altitudes, **each)), float),
         meters_per_unit=draw(st.floats(1e-3, 1e3)) if system == "plane" else 1.0,
     )
 

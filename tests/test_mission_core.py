@@ -1,5 +1,7 @@
 """Plans of missions: meters on the ground, reasons for tasks that are left out, files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,3 +84,16 @@ def test_better_plans_are_told_as_they_come():
     ranks = [(found.objective, -found.length_m) for found in told]
     assert ranks == sorted(ranks)
     assert (plan.objective, -plan.length_m) >= ranks[-1]
+
+
+def test_a_plan_keeps_its_bound_and_altitudes_and_refuses_a_wrong_bound(tmp_path):
+    tasks = tasks_at((47.01, 8.0))
+    fleet = Fleet((Uav("b", 3_000.0, level=1),))
+    plan = replace(make_plan(tasks, fleet, Schedule([[0]]), "by hand"), bound=1.5)
+    save_plan(plan, tmp_path / "mission.json")
+    read = load_plan(tmp_path / "mission.json")
+    assert (read.bound, read.fleet.level_of(0)) == (1.5, 1)
+    assert read.gap == pytest.approx(1 / 3)
+    save_plan(replace(plan, bound=0.5), tmp_path / "mission.json")
+    with pytest.raises(ValueError, match=r"bound is 0\.5, but it is finite and at least 1"):
+        load_plan(tmp_path / "mission.json")

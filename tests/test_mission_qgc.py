@@ -34,8 +34,8 @@ UP = FlightOptions(altitude_m=50, altitude_step_m=10)
 
 def item(command=16, *params, frame=3, **keys):
     """The last parameters given are latitude, longitude and altitude."""
-    params = [*params[:-3], *[0] * (7 - len(params)), *params[-3:]] if params else [0] * 7
-    return {"type": "SimpleItem", "command": command, "frame": frame, "params": params, "autoContinue": True, **keys}
+    filled = [*params[:-3], *[0] * (7 - len(params)), *params[-3:]] if params else [0] * 7
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": filled, "autoContinue": True, **keys}
 
 
 def plan(*items, **keys):

@@ -3,6 +3,7 @@
 import io
 import math
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances
+from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.read import read_fleet, read_tasks, read_tasks_from_bytes
 from sb3_uav.missions.readers import instance_files
 from sb3_uav.missions.readers.checks import MAX_TASKS, check_tasks
 from sb3_uav.missions.tasks import TaskList
 
 CSV = b"id,lat,lon,value\na,47.1,8.1,2\nb,47.2,8.2,1\n"
+
+
+def fleet_of(tasks: TaskList) -> Fleet:
+    assert tasks.fleet is not None
+    return tasks.fleet
+
+
+def depot_of(tasks: TaskList) -> list[float]:
+    assert tasks.depot is not None
+    depot: list[float] = tasks.depot.tolist()
+    return depot
 
 
 def npz_bytes(instances):
@@ -81,14 +94,16 @@ def test_files_that_are_none(tmp_path):
 def test_a_depot_as_an_option(tmp_path):
     (tmp_path / "t.csv").write_bytes(CSV)
     assert read_tasks(tmp_path / "t.csv").depot is None
-    for depot in ("47,8", "47 8", (47, 8)):
-        assert read_tasks(str(tmp_path / "t.csv"), depot=depot).depot.tolist() == [47, 8]
-    for depot, message in (
+    allowed: tuple[Any, ...] = ("47,8", "47 8", (47, 8))
+    for depot in allowed:
+        assert depot_of(read_tasks(str(tmp_path / "t.csv"), depot=depot)) == [47, 8]
+    refused: tuple[tuple[Any, str], ...] = (
         ("470,8", "depot: lat is 470"),
         ("147,8", "depot: lat is 147; latitudes are within 90 degrees, and lon is 8: are they swapped?"),
         ("47", "'47' is no position"),
         ((math.nan, 8), "depot: lat is nan; give a finite number"),
-    ):
+    )
+    for depot, message in refused:
         with pytest.raises(ValueError, match=message):
             read_tasks(tmp_path / "t.csv", depot=depot)
 
@@ -100,14 +115,14 @@ def test_a_team_orienteering_file():
     assert tasks.places[0] == "row 5"
     lines = (FILES / "b1.2.a.txt").read_text().splitlines()
     assert [*tasks.points[0], tasks.values[0]] == [float(word) for word in lines[4].split()]
-    assert len(tasks.fleet) == 2
-    assert {uav.range_m for uav in tasks.fleet} == {float(lines[2].split()[1])}
+    assert len(fleet_of(tasks)) == 2
+    assert {uav.range_m for uav in fleet_of(tasks)} == {float(lines[2].split()[1])}
 
 
 def test_vehicles_that_end_elsewhere():
     instance = Instances.from_arrays([0, 0], [[1, 2], [3, 4]], [1, 2], 10, 2, end=[[5, 5], [5, 5]])
     tasks = read_tasks_from_bytes("t.txt", chao_text(instance).encode(), unit="km")
-    assert [(uav.range_m, uav.start, uav.end) for uav in tasks.fleet] == [(10_000, None, (5, 5))] * 2
+    assert [(uav.range_m, uav.start, uav.end) for uav in fleet_of(tasks)] == [(10_000, None, (5, 5))] * 2
     assert tasks.points.tolist() == [[1, 2], [3, 4]]
     assert tasks.meters_per_unit == 1000
     with pytest.raises(ValueError, match=r"t\.txt, line 4: the score is -1"):
@@ -121,7 +136,7 @@ def test_oplib():
         tasks = read_tasks_from_bytes(name, oplib_text(instance, depot=2).encode())
         assert tasks.ids == ("1", "3")
         assert tasks.points.tolist() == [[1, 2], [3, 4]]
-        assert [uav.range_m for uav in tasks.fleet] == [10]
+        assert [uav.range_m for uav in fleet_of(tasks)] == [10]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +163,7 @@ def test_an_npz_with_everything():
     assert tasks.must.tolist() == [False, True, False]
     # Half a kilometer of flight takes 500 s at 1 m/s.
     assert tasks.service_s.tolist() == [0, 500, 0]
-    assert [(uav.range_m, uav.speed_mps, uav.start, uav.end) for uav in tasks.fleet] == [
+    assert [(uav.range_m, uav.speed_mps, uav.start, uav.end) for uav in fleet_of(tasks)] == [
         (10_000, 1, (1, 1), (0, 0)),
         (20_000, 1, (0, 0), (2, 2)),
     ]
@@ -159,7 +174,7 @@ def test_an_npz_is_the_same_problem_as_before():
 
     before = whole_problem()
     tasks = read_tasks_from_bytes("t.npz", npz_bytes(before))
-    assert make_instance(tasks, tasks.fleet).digest() == before.digest()
+    assert make_instance(tasks, fleet_of(tasks)).digest() == before.digest()
 
 
 def test_one_of_several_instances():
@@ -173,7 +188,7 @@ def test_one_of_several_instances():
     with pytest.raises(ValueError, match=r"row 0 is asked for, but only \.npz files have rows"):
         read_tasks_from_bytes("t.csv", CSV, row=0)
     tasks = read_tasks_from_bytes("t.npz", data, row=1)
-    assert tasks.points.tolist() == [[5, 6]] and tasks.fleet.uavs[0].range_m == 3
+    assert tasks.points.tolist() == [[5, 6]] and fleet_of(tasks).uavs[0].range_m == 3
 
 
 def test_large_fleets_take_no_memory():
@@ -195,7 +210,8 @@ def test_small_files_with_large_arrays_are_not_unpacked(monkeypatch):
     with pytest.raises(ValueError, match="the file holds 1 arrays of 8 MiB; at most 100 arrays of 1 MiB are read"):
         read_tasks_from_bytes("t.npz", file.getvalue())
     file = io.BytesIO()
-    np.savez(file, **{f"a{number}": np.zeros(1) for number in range(101)})
+    arrays: dict[str, Any] = {f"a{number}": np.zeros(1) for number in range(101)}
+    np.savez(file, **arrays)
     with pytest.raises(ValueError, match="the file holds 101 arrays of 0 MiB; at most 100 arrays"):
         read_tasks_from_bytes("t.npz", file.getvalue())
 
@@ -279,14 +295,14 @@ WPL = b"QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t47\t8\t400\t1\n1\t0\t3\t16\t5\t0\t
 def test_maps_and_ground_stations(name, data):
     tasks = read_tasks_from_bytes(name, data)
     assert tasks.points.tolist() == [[47.1, 8.1]]
-    assert tasks.depot.tolist() == [47, 8]
+    assert depot_of(tasks) == [47, 8]
     with pytest.raises(ValueError, match="the unit 'km' is for x and y, but the file has lat and lon"):
         read_tasks_from_bytes(name, data, unit="km")
     if data is GEOJSON:
         with pytest.raises(ValueError, match="one of the points is the depot already"):
             read_tasks_from_bytes(name, data, depot="46,7")
     elif data in (PLAN, WPL):
-        assert read_tasks_from_bytes(name, data, depot="46,7").depot.tolist() == [46, 7]
+        assert depot_of(read_tasks_from_bytes(name, data, depot="46,7")) == [46, 7]
 
 
 def test_what_all_formats_share_is_checked_in_each():

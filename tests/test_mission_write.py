@@ -247,9 +247,11 @@ def numbers_on(plan: Plan) -> list[str]:
 def test_stops_are_numbered_where_there_is_room() -> None:
     circle = [(100 * math.cos(t), 100 * math.sin(t)) for t in np.linspace(0, 6, 30)]
     assert sorted(numbers_on(plane_plan(circle)), key=int) == [str(n) for n in range(1, 31)]
-    crowd = [(0.1 * n, 0.0) for n in range(100)]
+    crowd = [(500 + 0.1 * n, 0.0) for n in range(100)]
     crowded = numbers_on(plane_plan([*crowd, (1000, 1000)]))
     assert 2 <= len(crowded) < 10 and {"1", "101"} <= set(crowded)
+    # Nor over the depot.
+    assert numbers_on(plane_plan([(0, 1), (1000, 1000)])) == ["2"]
 
 
 def test_the_picture_is_true_to_scale() -> None:

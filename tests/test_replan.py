@@ -140,7 +140,8 @@ def test_tasks_of_a_lost_uav_are_free():
     assert (found.lost, found.freed, found.removed) == (("a",), ("t1", "t2"), ())
     # Only legs of UAVs that fly count: from the start to t3 is not kept, t3 to t4 and to the end are.
     assert (found.n_kept, found.n_remaining, found.method) == (2, 3, "insertion")
-    assert "Altitude steps are counted anew without a; check the altitude of b." in found.plan.remarks
+    # UAV b keeps its altitude.
+    assert [found.plan.fleet.level_of(place) for place in range(1)] == [1]
 
 
 def test_insertion_comes_first_and_more_change_only_for_more_value():

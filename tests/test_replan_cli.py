@@ -112,6 +112,38 @@ def test_errors_write_nothing(mission, capsys, status, arguments, message):
     assert {path.name for path in mission.iterdir()} == {"mission.json"}
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("system", "moon", "system is 'moon'; it is one of wgs84, plane."),
+        ("depot", [float("nan"), 8.0], "depot is [nan, 8.0]; give latitude and longitude in degrees."),
+        ("depot", [47.0, 10**400], "OverflowError"),
+        ("seed", 1e400, "OverflowError"),
+        ("fleet", None, "TypeError"),
+        ("past", [1], "AttributeError"),
+        ("routes", [["n1"], ["n3"]], "KeyError 'n3'"),
+    ],
+)
+def test_a_changed_plan_is_an_error(mission, capsys, field, value, message):
+    path = mission / "mission.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), field: value}))
+    assert replan("lost,north\n", "mission") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("sb3-uav replan: error: mission/mission.json: ") and error.count("\n") == 1
+    assert message in error
+
+
+def test_a_plan_that_is_nested_deeply_or_names_something_twice_is_an_error(mission, capsys):
+    path = mission / "mission.json"
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "tasks": [data["tasks"][0], *data["tasks"]]}))
+    assert replan("lost,north\n", "mission") == 2
+    assert "two tasks have the same name" in capsys.readouterr().err
+    path.write_text("[" * 100_000)
+    assert replan("lost,north\n", "mission") == 2
+    assert "this is not JSON" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["[]", "{}", "[" * 100_000, '{"flight": 3}', '{"flight": {"altitude_m": -1}}', "\udcff"])
 def test_a_summary_of_any_content(mission, text):
     from sb3_uav.cli.replan import _former_flight

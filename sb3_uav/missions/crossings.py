@@ -58,7 +58,7 @@ class _Legs:
         :return: Its legs; none if it stays where it is
         """
         plane = plan.tasks.coordinates().to_plane(route.points)
-        own = flight.altitude_of(uav)
+        own = flight.altitude_of(plan.fleet.level_of(uav))
         wanted = plan.tasks.altitudes[list(route.stops)]
         altitudes = np.array([own, *np.where(np.isnan(wanted), own, wanted), own])
         points = np.column_stack([plane, altitudes])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def plan_html(plan: Plan) -> str:
         names.append(f'<tr><td></td><td colspan="2">and {count(len(plan.routes) - _MAX_ROWS, "more UAV")}</td></tr>')
     remarks = "".join(f"<div>{escaped(remark, _SENTENCE)}</div>" for remark in plan.remarks[:_MAX_ROWS])
     return (
-        f"<div><div><b>{escaped(plan.tasks.source)}</b>: {escaped(headline(plan), _SENTENCE)}</div>"
+        f"<div><div><b>{escaped(Path(plan.tasks.source).name)}</b>: {escaped(headline(plan), _SENTENCE)}</div>"
         f"{view.svg([*lines, *marks, view.depot(np.zeros(2))])}{outside}"
         f'<table style="border-collapse:collapse;margin:4px 0">{"".join(names)}</table>{remarks}</div>'
     )

@@ -20,6 +20,7 @@ class Uav:
     :param end: Where it has to land, in the user's coordinates; at the depot when None
     :param reserve_percent: Part of the range that no plan may use
     :param full_range_m: How far it flies with a full battery, in meters, if that is more than ``range_m``
+    :param level: Number of its altitude among those of the fleet, from 0; its place in the fleet when None
     """
 
     id: str
@@ -29,10 +30,11 @@ class Uav:
     end: tuple[float, float] | None = None
     reserve_percent: float = 0.0
     full_range_m: float | None = None
+    level: int | None = None
 
     @property
     def usable_m(self) -> float:
-        """Metres that a plan may use."""
+        """Meters that a plan may use."""
         return self.range_m * (1.0 - self.reserve_percent / 100.0)
 
 
@@ -55,6 +57,14 @@ class Fleet:
 
     def __iter__(self) -> Iterator[Uav]:
         return iter(self.uavs)
+
+    def level_of(self, place: int) -> int:
+        """
+        :param place: Place of a UAV in the fleet, from 0
+        :return: Number of its altitude, which stays the same when others are lost
+        """
+        level = self.uavs[place].level
+        return place if level is None else level
 
     @classmethod
     def of_equal(

@@ -130,7 +130,7 @@ def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
     for number, route in enumerate(plan.routes):
         if route.length_m > 0:
             wanted = plan.tasks.altitudes[list(route.stops)]
-            if np.nanmax(np.array([flight.altitude_of(number), *wanted])) > _HIGH_M:
+            if np.nanmax(np.array([flight.altitude_of(plan.fleet.level_of(number)), *wanted])) > _HIGH_M:
                 high.append(route.uav.id)
     if not high:
         return []
@@ -146,7 +146,7 @@ def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
     if plan.tasks.system != "wgs84" or flight.landing != "rtl" or len(flying) < 2:
         return []
     name = "RTL_RETURN_ALT" if flight.firmware == "px4" else "RTL_ALT"
-    lowest = min(flight.altitude_of(number) for number in flying)
+    lowest = min(flight.altitude_of(plan.fleet.level_of(number)) for number in flying)
     return [
         f"UAVs below the return altitude of their autopilot ({name}) climb to it on the way back; set it to {lowest:g} m or "
         f"less, or their legs home are at one altitude."

@@ -76,12 +76,9 @@ def situation_of(plan: Plan, status: Status) -> Situation:
         )
     gone = tuple(name for name in plan.tasks.ids if name not in number)
     lost = tuple(uav.id for uav in plan.fleet if uav.id in status.lost)
-    followers = [uav.id for place, uav in enumerate(uavs) if plan.fleet.uavs[place].id != uav.id]
-    if followers:
-        remarks.append(f"Altitude steps are counted anew without {named(lost)}; check the altitude of {named(followers)}.")
     return Situation(
         tasks,
-        replace(plan.fleet, uavs=tuple(uavs)),
+        replace(plan.fleet, uavs=_at_their_levels(plan, uavs)),
         tuple(tuple(number[name] for name in _names(plan, route) if name in number) for route in left),
         added,
         gone,
@@ -89,6 +86,14 @@ def situation_of(plan: Plan, status: Status) -> Situation:
         bool(added or gone or lost) or any(uav is not route.uav for uav, route in zip(uavs, left, strict=True)),
         tuple(remarks),
     )
+
+
+def _at_their_levels(plan: Plan, uavs: Sequence[Uav]) -> tuple[Uav, ...]:
+    """:return: The UAVs that are left, each at the altitude that it had: those in the air must not meet on a new one"""
+    if len(uavs) == len(plan.fleet):
+        return tuple(uavs)
+    levels = {uav.id: plan.fleet.level_of(place) for place, uav in enumerate(plan.fleet)}
+    return tuple(replace(uav, level=levels[uav.id]) for uav in uavs)
 
 
 def _names(plan: Plan, route: Route) -> list[str]:

@@ -36,6 +36,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from sb3_uav.missions.coordinates import System
+from sb3_uav.missions.readers.table import DELIMITERS, decoded
 from sb3_uav.missions.status import KINDS, NewTask, RemainingUnit, Status, UavReport
 
 _MAX_BYTES = 10 * 2**20
@@ -233,18 +234,13 @@ def _rows(data: bytes, source: str) -> tuple[list[tuple[int, _Row]], set[str]]:
     """
     if len(data) > _MAX_BYTES:
         raise ValueError(f"{source}: the file has more than {_MAX_BYTES // 2**20} MB; a status file is far smaller.")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{source}: byte {error.start} is no UTF-8; save the file as CSV UTF-8.") from error
-    if "\0" in text:
-        raise ValueError(f"{source}: there are zero bytes in it; save the file as CSV UTF-8.")
+    text = decoded(data, source)
     head = text.lstrip().partition("\n")[0]
-    delimiter = max(",;\t", key=head.count)
+    delimiter = max(DELIMITERS, key=head.count)
     try:
-        table = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True))
+        table = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=True))
     except csv.Error as error:
-        raise ValueError(f"{source}: this is no CSV file ({error}).") from error
+        raise ValueError(f"{source}: this is no CSV file ({error}); look for a quote that is not closed.") from error
     numbered = [
         (number, [cell.strip() for cell in cells]) for number, cells in enumerate(table, 1) if any(map(str.strip, cells))
     ]

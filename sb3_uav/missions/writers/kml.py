@@ -39,7 +39,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
     check_is_geographic(tasks, "KML files")
     root = ElementTree.Element("kml", xmlns=_NAMESPACE)
     document = ElementTree.SubElement(root, "Document")
-    _text(document, "name", f"Routes for {tasks.source}")
+    _text(document, "name", f"Routes for {Path(tasks.source).name}")
     for number, color in enumerate(_COLORS):
         style = ElementTree.SubElement(document, "Style", id=f"uav-{number}")
         line = ElementTree.SubElement(style, "LineStyle")
@@ -60,7 +60,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
 
 
 def _route_folder(document: ElementTree.Element, plan: Plan, uav: int, route: Route, flight: FlightOptions) -> None:
-    tasks, own = plan.tasks, flight.altitude_of(uav)
+    tasks, own = plan.tasks, flight.altitude_of(plan.fleet.level_of(uav))
     altitudes = altitudes_of(plan, uav, flight)
     folder = _folder(document, route.uav.id)
     placemark = ElementTree.SubElement(folder, "Placemark")

@@ -6,6 +6,7 @@ import html
 import itertools
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -342,7 +343,11 @@ def _layout(plan: Plan, points: MapPoints) -> dict[str, Any]:
         ranges = [{"range": [float(low[row] - margin), float(high[row] + margin)]} for row in (0, 1)]
     return {
         "template": "none",
-        "title": {"text": f"{_text(plan.tasks.source)}<br><sup>{headline(plan)}</sup>", "x": 0.02, "xanchor": "left"},
+        "title": {
+            "text": f"{_text(Path(plan.tasks.source).name)}<br><sup>{headline(plan)}</sup>",
+            "x": 0.02,
+            "xanchor": "left",
+        },
         "font": {"family": FONT, "size": 13, "color": "#1d2125"},
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#fafbfc",

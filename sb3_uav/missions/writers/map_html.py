@@ -75,7 +75,7 @@ def map_page(plan: Plan) -> str:
             "form-action 'none'",
         ]
     )
-    title = escaped(plan.tasks.source)
+    title = escaped(Path(plan.tasks.source).name)
     body = "\n".join(
         [
             f"<h1>{title}</h1>",

@@ -69,7 +69,8 @@ def map_figure(plan: Plan) -> Any:
     size = float(np.clip(18 * math.sqrt(80 / max(len(tasks), 1)), 5, 28))
     if depot is not None:
         axes.scatter(*depot, marker="s", s=65, color="black", zorder=6, label="depot")
-    taken: list[np.ndarray] = []
+    # No number over the depot.
+    taken: list[np.ndarray] = [] if depot is None else [depot * points_per_meter]
     for uav, (route, path) in enumerate(zip(plan.routes, paths, strict=True)):
         _draw_route(axes, plan, uav, route, path, size)
     for route, path in zip(plan.routes, paths, strict=True):

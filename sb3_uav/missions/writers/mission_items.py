@@ -77,7 +77,7 @@ def altitudes_of(plan: Plan, uav: int, flight: FlightOptions) -> list[float]:
     :param flight: How it is flown
     :return: Meters above the depot at every stop; what a task says, or else the altitude of the UAV
     """
-    own = flight.altitude_of(uav)
+    own = flight.altitude_of(plan.fleet.level_of(uav))
     wanted = (float(plan.tasks.altitudes[task]) for task in plan.routes[uav].stops)
     return [own if np.isnan(altitude) else altitude for altitude in wanted]
 
@@ -103,7 +103,13 @@ def mission_items(plan: Plan, uav: int, flight: FlightOptions) -> list[Item]:
     route, is_fixed_wing = plan.routes[uav], flight.vehicle == "fixed-wing"
     speed = route.uav.speed_mps
     (start, *_), end = route.points.tolist(), route.points[-1].tolist()
-    items = [Item(TAKEOFF, (_PITCH if is_fixed_wing else 0.0, 0.0, 0.0, None), (start[0], start[1], flight.altitude_of(uav)))]
+    items = [
+        Item(
+            TAKEOFF,
+            (_PITCH if is_fixed_wing else 0.0, 0.0, 0.0, None),
+            (start[0], start[1], flight.altitude_of(plan.fleet.level_of(uav))),
+        )
+    ]
     if speed is not None:
         # The first parameter is 0 for airspeed, which is what fixed wings control, and 1 for speed over ground.
         items.append(Item(CHANGE_SPEED, (0.0 if is_fixed_wing else 1.0, float(speed), -1.0, 0.0)))

@@ -39,7 +39,7 @@ def summary_of(plan: Plan, flight: FlightOptions, files: Mapping[str, str] | Non
         "n_tasks": len(tasks),
         "n_served": plan.n_served,
         "length_m": _meters(plan.length_m),
-        "uavs": [_uav(route, flight.altitude_of(number)) for number, route in enumerate(plan.routes)],
+        "uavs": [_uav(route, flight.altitude_of(plan.fleet.level_of(number))) for number, route in enumerate(plan.routes)],
         "skipped": [
             {
                 "task": tasks.ids[skipped.task],
