@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -16,6 +17,10 @@ import pytest
 from web_server import Served, problem, served
 
 from sb3_uav.cli.main import main
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.missions.fleet import Fleet
+from sb3_uav.missions.search import make_plan
+from sb3_uav.missions.tasks import TaskList
 
 for module in ("fastapi", "uvicorn", "pyproj", "plotly", "matplotlib", "numba"):
     pytest.importorskip(module)
@@ -237,6 +242,18 @@ def test_bodies_are_measured_while_they_come_in(server: Served):
     just_fits = server.ask("POST", "/api/v1/tasks?name=a.csv", b"x" * 2**20)
     assert just_fits.status == 422
     assert server.ask("GET", "/api/v1/limits").status == 200
+
+
+def test_bound_and_gap_are_reported():
+    from sb3_uav.web.plan_view import report_of
+
+    tasks = TaskList.of("ab", [[3, 4], [6, 8]], "plane", [1, 2], depot=(0, 0))
+    plan = make_plan(tasks, Fleet.of_equal(1, 12.0), Schedule([[0]]), "by hand")
+    assert [report_of(plan)[key] for key in ("bound", "gap")] == [None, None]
+    report = report_of(dataclasses.replace(plan, bound=2.0), ["c"])
+    assert (report["bound"], report["gap"], report["objective"]) == (2.0, 0.5, 1.0)
+    assert [one["text"] for one in report["skipped"]] == ["out of reach: 8 m of range are missing", "forbidden by you"]
+    assert "unserved" in report and report["remarks"] and not any("--" in remark for remark in report["remarks"])
 
 
 def test_requests_of_the_docs(server: Served):
