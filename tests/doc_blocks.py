@@ -75,6 +75,8 @@ _SMALL = "--conf-file small/{}.yml -n 1280 --num-threads 1"
 RULES = [
     # A server, which never ends.
     Rule("*", r"tensorboard --logdir (\S+)", r"tensorboard --logdir \1 --inspect"),
+    Rule("README.md", r"sb3-uav serve", "sb3-uav serve --help"),
+    Rule("README.md", r"(sb3-uav solve .*) -o", r"\1 --time-limit 1 -o"),
     # Smaller data, networks and budgets.
     Rule("README.md", r"rand\(16, ", "rand(2, "),
     Rule("README.md", r"n_envs=64", "n_envs=4"),
