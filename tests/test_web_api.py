@@ -173,7 +173,7 @@ def test_old_solves_are_dropped(server: Served):
         (changed(tasks__tasks__0__id="t1"), "tasks: task 2 has the id 't1' of an earlier task; ids must differ."),
         (changed(tasks__tasks__0__id="a\0"), "tasks.tasks.0.id: this has control characters; leave them out."),
         (changed(tasks__tasks__0__value="1"), "tasks.tasks.0.value: Input should be a valid number."),
-        (changed(tasks__tasks__0__service_s=4), "Task 't0' takes time, but UAV 'uav-1' has no speed."),
+        (changed(tasks__tasks__0__service_s=4), "Task 't0' takes time, but UAV 'uav-1' has no speed; give it one."),
         (
             changed(tasks__tasks__0__point=[1]),
             "tasks.tasks.0.point: List should have at least 2 items after validation, not 1.",

@@ -155,7 +155,10 @@ class Rooms:
             (len(uavs) > limits.max_uavs, f"This server admits {limits.max_uavs} UAVs at most."),
             (options.time_limit > limits.max_seconds, f"This server solves for {limits.max_seconds:g} s at most."),
             (given.tasks.depot is None, "There is no depot; say where the UAVs start and land."),
-            (first_timed and slow, f"Task {first_timed and first_timed.id!r} takes time, but UAV {slow!r} has no speed."),
+            (
+                first_timed and slow,
+                f"Task {first_timed and first_timed.id!r} takes time, but UAV {slow!r} has no speed; give it one.",
+            ),
         ):
             if is_wrong:
                 raise HTTPException(422, sentence)
