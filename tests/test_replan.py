@@ -252,6 +252,15 @@ def test_a_status_that_does_not_fit(status, message):
     assert message in str(error.value)
 
 
+def test_a_stop_where_the_uav_stands_is_kept_too():
+    """Its legs are 0 m long, but legs all the same."""
+    tasks = TaskList.of(["here", "there"], [(0.0, 0.0), (5.0, 0.0)], "plane", depot=(0.0, 0.0))
+    plan = make_plan(tasks, Fleet.of_equal(2, 100.0), Schedule([[0], [1]]), "by hand")
+    found = replan(plan, Status(dropped=("there",)), 0.0)
+    assert [route.stops for route in found.plan.routes] == [(0,), ()]
+    assert (found.n_kept, found.n_remaining) == (2, 2)
+
+
 def test_past_names_and_options_are_checked():
     plan = replan(line_plan([1, 2], [3]), Status(lost=("b",), done=("t1",)), 0.0).plan
     with pytest.raises(ValueError, match="uav b: UAV b was lost before"):
