@@ -220,7 +220,7 @@ def _write(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
     from sb3_uav.missions.write import write_mission
 
     mission = json.loads(zlib.decompress(blocks[0]))
-    plan = replace(plan_from_json(mission, PLAN_FILE), bound=mission.get("bound"))
+    plan = plan_from_json(mission, PLAN_FILE)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "mission"
         write_mission(plan, out, FlightOptions(**request["flight"]))
