@@ -84,8 +84,10 @@ def test_items_that_are_tasks(tasks):
     assert tasks.service_s.tolist() == [16.5, 1, 30, 0]
     assert tasks.altitudes.tolist() == pytest.approx([60, np.nan, np.nan, 70], nan_ok=True)
     assert tasks.values.tolist() == [1] * 4
-    (note,) = tasks.notes
-    for part in ("MAV_CMD 178 (1)", "MAV_CMD 206 (1)", "without a position (1)", "not relative to home (1)"):
+    lost, note = tasks.notes
+    assert "above the sea or the terrain (1, 400 m)" in lost
+    assert "flown at the altitude of the UAV above the depot" in lost
+    for part in ("MAV_CMD 178 (1)", "MAV_CMD 206 (1)", "without a position (1)"):
         assert part in note
 
 
