@@ -171,3 +171,26 @@ def test_names_that_are_too_many_or_hostile() -> None:
 
 def test_notes_of_the_file_are_told() -> None:
     assert "Mind the height." in remarks_on(plan_of([(1, 0)], [[0]], notes=("Mind the height.",)))
+
+
+def test_altitudes_of_stops_that_replace_the_option_are_told() -> None:
+    plan = plan_of([(1, 0), (2, 0), (3, 0)], [[0, 1]], altitudes=np.array([3, 20, 7]))
+    (remark,) = [remark for remark in remarks_on(plan, FlightOptions()) if "--altitude says" in remark]
+    assert remark.startswith("2 of 2 stops have altitudes of their own, 3 to 20 m above the depot")
+    level = plan_of([(1, 0), (2, 0)], [[0, 1]], altitudes=np.array([3, np.nan]))
+    assert any(
+        "1 of 2 stops have altitudes of their own, 3 m above" in remark for remark in remarks_on(level, FlightOptions())
+    )
+    assert not any("of their own" in remark for remark in remarks_on(plan_of([(1, 0)], [[0]]), FlightOptions()))
+
+
+def test_fixed_wings_need_a_takeoff_and_a_landing() -> None:
+    tasks = TaskList.of(["a"], [(47.01, 8.0)], "wgs84", depot=(47.0, 8.0))
+    plan = make_plan(tasks, Fleet.of_equal(1, 1e5), Schedule([[0]]), "by hand")
+
+    def told(**options: Any) -> list[str]:
+        return [remark for remark in remarks_on(plan, FlightOptions(**options)) if "Fixed wings" in remark]
+
+    assert told() == []
+    assert "may circle at home and not land" in told(vehicle="fixed-wing")[0]
+    assert "land without an approach" in told(vehicle="fixed-wing", landing="land")[0]

@@ -30,6 +30,7 @@ def remarks_on(plan: Plan, flight: FlightOptions | None = None) -> tuple[str, ..
     remarks = [*plan.notes, *_of_tasks(plan), *plan.tasks.notes, *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
     if flight is not None:
         remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight), *_of_return(plan, flight)]
+        remarks += _of_fixed_wings(plan, flight)
     return (*remarks, REVIEW)
 
 
@@ -126,6 +127,25 @@ def _of_crossings(plan: Plan, flight: FlightOptions) -> list[str]:
 
 
 def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
+    return [*_of_own_altitudes(plan), *_of_high_ones(plan, flight)]
+
+
+def _of_own_altitudes(plan: Plan) -> list[str]:
+    """A file of a ground station has an altitude for every waypoint, of which nobody may think when saying --altitude."""
+    served = [task for route in plan.routes for task in route.stops]
+    own = plan.tasks.altitudes[served]
+    own = own[~np.isnan(own)]
+    if len(own) == 0:
+        return []
+    low, high = own.min(), own.max()
+    span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return [
+        f"{len(own)} of {len(served)} stops have altitudes of their own, {span} m above the depot, whatever --altitude says; the "
+        f"legs between them are flown at these, too."
+    ]
+
+
+def _of_high_ones(plan: Plan, flight: FlightOptions) -> list[str]:
     high = []
     for number, route in enumerate(plan.routes):
         if route.length_m > 0:
@@ -150,4 +170,18 @@ def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
     return [
         f"UAVs below the return altitude of their autopilot ({name}) climb to it on the way back; set it to {lowest:g} m or "
         f"less, or their legs home are at one altitude."
+    ]
+
+
+def _of_fixed_wings(plan: Plan, flight: FlightOptions) -> list[str]:
+    """
+    What depends on the site: see https://docs.px4.io/main/en/flight_modes_fw/mission.html and
+    https://ardupilot.org/plane/docs/rtl-mode.html, in which a plane circles until somebody lands it.
+    """
+    if plan.tasks.system != "wgs84" or flight.vehicle != "fixed-wing" or plan.length_m == 0:
+        return []
+    end = "may circle at home and not land" if flight.landing == "rtl" else "land without an approach"
+    return [
+        f"Fixed wings: the missions take off without a heading, and at their end UAVs {end}; add a takeoff and a landing that "
+        f"fit the site in the ground station."
     ]
