@@ -140,8 +140,8 @@ def _of_own_altitudes(plan: Plan) -> list[str]:
     low, high = own.min(), own.max()
     span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return [
-        f"{len(own)} of {len(served)} stops have altitudes of their own, {span} m above the depot, whatever --altitude says; the "
-        f"legs between them are flown at these, too."
+        f"{len(own)} of {len(served)} stops have altitudes of their own, {span} m above the depot, whatever --altitude says; "
+        f"the legs between them are flown at these, too."
     ]
 
 

@@ -182,8 +182,8 @@ def _notes(found: _Found) -> tuple[str, ...]:
         low, high = min(found.lost_altitudes), max(found.lost_altitudes)
         span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         notes.append(
-            f"The file has altitudes above the sea or the terrain ({len(found.lost_altitudes)}, {span} m), which the missions do "
-            "not have: these tasks are flown at the altitude of the UAV above the depot; check it against the terrain."
+            f"The file has altitudes above the sea or the terrain ({len(found.lost_altitudes)}, {span} m), which the missions "
+            "do not have: these tasks are flown at the altitude of the UAV above the depot; check it against the terrain."
         )
     if found.left_out:
         counts = ", ".join(f"{what} ({count})" for what, count in sorted(found.left_out.items())[:_MOST_IN_NOTE])
