@@ -81,7 +81,13 @@ def test_third_coordinates_are_not_flown_and_a_note_says_so():
     tasks = read(collection(feature(8, 47, 30.5), feature(8, 48, 0), feature(8, 49, 400, alt=25)))
     assert tasks.altitudes.tolist() == pytest.approx([np.nan, np.nan, 25], nan_ok=True)
     assert "not flown" in tasks.notes[0]
-    assert read(collection(feature(8, 48, 0), feature(8, 49, 400, alt=25))).notes == ()
+    assert read(collection(feature(8, 48, 0, id="a"), feature(8, 49, 400, alt=25))).notes == ()
+
+
+def test_a_note_says_that_nothing_is_named():
+    (note,) = read(collection(feature(), feature(9, 48, OBJECTID=4))).notes
+    assert "the tasks are called 1, 2, ..." in note
+    assert read(collection(feature(name="a"), feature(9, 48))).notes == ()
 
 
 @pytest.mark.parametrize("flag", [1, 1.0, True])

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_uav.missions.coordinates import System
+from sb3_uav.missions.readers.checks import UNNAMED
 from sb3_uav.missions.readers.json_file import flag_of, id_of, number_of, parse_json, shown
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.writers.geojson_routes import PLANE_MEMBER
@@ -49,7 +50,7 @@ def read_geojson(data: bytes, source: str) -> TaskList:
     system, unit = _plane_of(content, source)
     rows: list[dict[str, Any]] = []
     depot: list[float] | None = None
-    has_heights = False
+    has_heights = has_names = False
     for number, feature in enumerate(_features_of(content, source), 1):
         where = f"{source}: feature {number}"
         position = _position_of(feature, where)
@@ -62,9 +63,11 @@ def read_geojson(data: bytes, source: str) -> TaskList:
             continue
         altitude = _first(properties, _ALTITUDE_NAMES)
         has_heights |= altitude is None and len(position) == 3 and position[2] != 0
+        name = _id_of(feature, properties, where)
+        has_names |= name is not None
         rows.append(
             {
-                "id": _id_of(feature, properties, number, where),
+                "id": str(number) if name is None else name,
                 "point": point,
                 "value": _number(properties, ("value", "priority"), 1.0, where),
                 "service_s": _number(properties, ("service_s",), 0.0, where),
@@ -88,7 +91,7 @@ def read_geojson(data: bytes, source: str) -> TaskList:
         meters_per_unit=unit,
         places=tuple(columns["place"]),
         source=source,
-        notes=(_HEIGHTS,) if has_heights else (),
+        notes=(*((_HEIGHTS,) if has_heights else ()), *(() if has_names else (UNNAMED,))),
     )
 
 
@@ -154,11 +157,11 @@ def _properties_of(feature: dict[str, Any], where: str) -> dict[str, Any]:
     return {**{name.lower(): value for name, value in properties.items()}, **properties}
 
 
-def _id_of(feature: dict[str, Any], properties: dict[str, Any], number: int, where: str) -> str:
+def _id_of(feature: dict[str, Any], properties: dict[str, Any], where: str) -> str | None:
     for holder, name in ((properties, "id"), (properties, "name"), (feature, "id")):
         if holder.get(name) not in (None, ""):
             return id_of(holder[name], name, where)
-    return str(number)
+    return None
 
 
 def _first(properties: dict[str, Any], names: tuple[str, ...]) -> Any:
