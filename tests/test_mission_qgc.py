@@ -111,6 +111,17 @@ def test_what_comes_after_the_start_of_the_landing_is_no_task():
     assert "landing pattern" in read(plan(item(16, 47, 8, 50), landing)).notes[0]
 
 
+def test_positions_beside_four_params_as_old_versions_wrote_them():
+    old = {**item(16, 12, 0, 0, None, 0, 0, 0), "params": [12, 0, 0, None], "coordinate": [47.1, 8.1, 20]}
+    tasks = read(plan(old, geoFence={"polygon": [], "version": 1}))
+    assert (tasks.points.tolist(), tasks.service_s.tolist(), tasks.altitudes.tolist()) == ([[47.1, 8.1]], [12], [20])
+    # Later ones have both, of which the seven count.
+    assert read(plan({**OK, "coordinate": [1, 2, 3]})).points.tolist() == [[47, 8]]
+    for wrong in ([47.1, 8.1], "47.1", None):
+        with pytest.raises(ValueError, match=r"item 1: params is \[12, 0, 0, null\]; write a list of 7 numbers"):
+            read(plan({**old, "coordinate": wrong}))
+
+
 @pytest.mark.parametrize("home", [None, [None, None, None], [0, 0, 0], [0.0, 0.0]])
 def test_home_may_be_missing(home):
     document = copy.deepcopy(DOCUMENT)
