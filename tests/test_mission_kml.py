@@ -33,6 +33,7 @@ def test_folders_lines_and_stops(tmp_path):
     folders = {folder.findtext(f"{KML}name"): folder for folder in root.iter(f"{KML}Folder")}
     assert list(folders) == ["one", "two", "three", "Skipped tasks"]
     assert {mode.text for mode in root.iter(f"{KML}altitudeMode")} == {"relativeToGround"}
+    assert "flown above the depot" in root.findtext(f"{KML}Document/{KML}description")
     names = [placemark.findtext(f"{KML}name") for placemark in folders["one"].iter(f"{KML}Placemark")]
     assert names == ["Route of one", "1: a", "2: b & <b>"]
     assert vertices(folders["one"].findall(f"{KML}Placemark")[2]) == [(-179.99, -17.01, 30.0)]
