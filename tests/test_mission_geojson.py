@@ -136,6 +136,7 @@ def shaped(kind, coordinates):
         (collection(feature(), sb3_uav_plane=None), "meters_per_unit of sb3_uav_plane is null"),
         ({"type": "Point", "coordinates": [8, 47]}, "type is 'Point'; write a FeatureCollection"),
         ({"type": "FeatureCollection"}, "features is null"),
+        ({"items": [], "plannedHomePosition": [47, 8, 0]}, "this is a mission of an old QGroundControl"),
         ([feature()], "there is .* where an object of JSON is expected"),
     ],
 )

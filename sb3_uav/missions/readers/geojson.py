@@ -99,6 +99,8 @@ def _features_of(content: dict[str, Any], source: str) -> list[Any]:
     kind = content.get("type")
     if kind == "Feature":
         return [content]
+    if kind is None and "plannedHomePosition" in content:
+        raise ValueError(f"{source}: this is a mission of an old QGroundControl; open it there and save it as .plan.")
     if kind != "FeatureCollection":
         raise ValueError(f"{source}: type is {shown(kind)}; write a FeatureCollection of Points.")
     features = content.get("features")
