@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_uav.missions.crossings import SEPARATION_M, find_crossings
 from sb3_uav.missions.flight import FlightOptions
-from sb3_uav.missions.labels import shown
+from sb3_uav.missions.labels import count, shown
 from sb3_uav.missions.plan import Plan
 
 REVIEW = "A person must review this plan before it is flown. Wind, terrain, obstacles and no-fly zones are not modeled."
@@ -117,13 +117,13 @@ def _of_crossings(plan: Plan, flight: FlightOptions) -> list[str]:
         return []
     ids = [uav.id for uav in plan.fleet]
     pairs = dict.fromkeys(f"{ids[crossing.uavs[0]]} with {ids[crossing.uavs[1]]}" for crossing in crossings)
-    count = "1 pair of legs crosses" if len(crossings) == 1 else f"{len(crossings)} pairs of legs cross"
+    found = "1 pair of legs crosses" if len(crossings) == 1 else f"{len(crossings)} pairs of legs cross"
     advice = (
         f"--altitude-step {2 * SEPARATION_M:g} keeps the UAVs apart"
         if flight.altitude_step_m < SEPARATION_M
         else "tasks with altitudes of their own bring UAVs to one level"
     )
-    return [f"At one altitude (less than {SEPARATION_M:g} m apart) {count}: {named(list(pairs))}; {advice}."]
+    return [f"At one altitude (less than {SEPARATION_M:g} m apart) {found}: {named(list(pairs))}; {advice}."]
 
 
 def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
@@ -140,8 +140,8 @@ def _of_own_altitudes(plan: Plan) -> list[str]:
     low, high = own.min(), own.max()
     span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return [
-        f"{len(own)} of {len(served)} stops have altitudes of their own, {span} m above the depot, whatever --altitude says; "
-        f"the legs between them are flown at these, too."
+        f"The file says the altitude of {len(own)} of {count(len(served), 'stop')}: {span} m above the depot, whatever "
+        f"--altitude says; the legs between them are flown at these, too."
     ]
 
 
@@ -165,7 +165,15 @@ def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
     flying = [number for number, route in enumerate(plan.routes) if route.length_m > 0]
     if plan.tasks.system != "wgs84" or flight.landing != "rtl" or len(flying) < 2:
         return []
+    last = {number: plan.tasks.altitudes[plan.routes[number].stops[-1]] for number in flying if plan.routes[number].stops}
     name = "RTL_RETURN_ALT" if flight.firmware == "px4" else "RTL_ALT"
+    own = {number: altitude for number, altitude in last.items() if not np.isnan(altitude)}
+    if own:
+        names = named([f"{plan.routes[number].uav.id} at {altitude:g} m" for number, altitude in own.items()])
+        return [
+            f"UAVs return at the altitude of their last stop ({names}), or at that of their autopilot ({name}) where it is "
+            f"higher: see that nothing is in their way, and that they do not come back at once."
+        ]
     lowest = min(flight.altitude_of(plan.fleet.level_of(number)) for number in flying)
     return [
         f"UAVs below the return altitude of their autopilot ({name}) climb to it on the way back; set it to {lowest:g} m or "

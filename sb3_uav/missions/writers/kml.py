@@ -67,6 +67,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
 def _route_folder(document: ElementTree.Element, plan: Plan, uav: int, route: Route, flight: FlightOptions) -> None:
     tasks, own = plan.tasks, flight.altitude_of(plan.fleet.level_of(uav))
     altitudes = altitudes_of(plan, uav, flight)
+    last = altitudes[-1] if altitudes else own
     folder = _folder(document, route.uav.id)
     placemark = ElementTree.SubElement(folder, "Placemark")
     _text(placemark, "name", f"Route of {route.uav.id}")
@@ -79,7 +80,7 @@ def _route_folder(document: ElementTree.Element, plan: Plan, uav: int, route: Ro
     parent = ElementTree.SubElement(placemark, "MultiGeometry")
     vertices = [
         (longitude, latitude, altitude)
-        for (latitude, longitude), altitude in zip(route.points.tolist(), [own, *altitudes, own], strict=True)
+        for (latitude, longitude), altitude in zip(route.points.tolist(), [own, *altitudes, last], strict=True)
     ]
     for part in split_at_antimeridian(vertices):
         line = ElementTree.SubElement(parent, "LineString")
