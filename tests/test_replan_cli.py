@@ -70,6 +70,19 @@ def test_a_mission_in_the_air(mission, capsys):
     assert again.past_tasks == plan.past_tasks
 
 
+def test_routes_are_kept_for_a_small_gain(mission, capsys):
+    # The UAV serves one task, and the new one is worth a little more.
+    fleet = Fleet((Uav("a", 5_000.0),))
+    tasks = TaskList.of(["n1", "s1"], [(47.02, 8.0), (46.98, 8.0)], "wgs84", [100, 1], depot=(47.0, 8.0))
+    save_plan(make_plan(tasks, fleet, Schedule([[0]]), "by hand"), mission / "mission.json")
+    status = "task,new,46.98,8.001,,103,,\n"
+    assert replan(status, "mission") == 0
+    assert "1 of 3 tasks served, value 100 of 204" in capsys.readouterr().out
+    assert replan(status, "mission", "--min-gain", "0") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "for a value of 104 in place of 100; --min-gain asks for more." in printed
+
+
 def test_how_it_is_flown_stays(mission):
     from sb3_uav.missions.write import write_mission
 
