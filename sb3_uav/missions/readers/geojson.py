@@ -116,8 +116,10 @@ def _check_crs(content: dict[str, Any], source: str) -> None:
     properties = crs.get("properties") if isinstance(crs, dict) else None
     name = properties.get("name") if isinstance(properties, dict) else None
     if not isinstance(name, str) or name not in _CRS84:
+        # By its definition latitudes come first there, but most programs write them second.
+        more = ", or delete crs if longitudes come first in the coordinates" if str(name).endswith(":4326") else ""
         raise ValueError(
-            f"{source}: crs is {shown(crs if name is None else name)}; export longitudes and latitudes on WGS84 (CRS84)."
+            f"{source}: crs is {shown(crs if name is None else name)}; export longitudes and latitudes on WGS84 (CRS84){more}."
         )
 
 
@@ -171,5 +173,5 @@ def _first(properties: dict[str, Any], names: tuple[str, ...]) -> Any:
 
 
 def _number(properties: dict[str, Any], names: tuple[str, ...], default: float, where: str) -> float:
-    value = _first(properties, names)
-    return default if value is None else number_of(value, names[0], where, 0.0)
+    name = next((name for name in names if properties.get(name) is not None), None)
+    return default if name is None else number_of(properties[name], name, where, 0.0)
