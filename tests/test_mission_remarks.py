@@ -209,3 +209,13 @@ def test_returns_from_stops_with_altitudes_of_their_own() -> None:
     plan = make_plan(tasks, Fleet.of_equal(2, 1e5), Schedule([[0], [1]]), "by hand")
     (remark,) = [remark for remark in remarks_on(plan, FlightOptions()) if "RTL_RETURN_ALT" in remark]
     assert remark.startswith("UAVs return at the altitude of their last stop (uav-2 at 3 m), or at that of their autopilot")
+
+
+def test_altitudes_count_from_where_a_uav_is_armed() -> None:
+    def told(start: tuple[float, float] | None) -> list[str]:
+        tasks = TaskList.of(["a"], [(47.01, 8.0)], "wgs84", depot=(47.0, 8.0))
+        plan = make_plan(tasks, Fleet((Uav("hill", 1e5, start=start),)), Schedule([[0]]), "by hand")
+        return [remark for remark in remarks_on(plan, FlightOptions()) if "armed" in remark]
+
+    assert told(None) == told((47.0, 8.0)) == []
+    assert "not the depot (hill)" in told((47.02, 8.0))[0]

@@ -127,7 +127,7 @@ def _of_crossings(plan: Plan, flight: FlightOptions) -> list[str]:
 
 
 def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
-    return [*_of_own_altitudes(plan), *_of_high_ones(plan, flight)]
+    return [*_of_own_altitudes(plan), *_of_other_launches(plan), *_of_high_ones(plan, flight)]
 
 
 def _of_own_altitudes(plan: Plan) -> list[str]:
@@ -142,6 +142,22 @@ def _of_own_altitudes(plan: Plan) -> list[str]:
     return [
         f"The file says the altitude of {len(own)} of {count(len(served), 'stop')}: {span} m above the depot, whatever "
         f"--altitude says; the legs between them are flown at these, too."
+    ]
+
+
+def _of_other_launches(plan: Plan) -> list[str]:
+    """Altitudes of autopilots count from home, which is where they were armed."""
+    depot = plan.tasks.depot
+    if plan.tasks.system != "wgs84" or depot is None:
+        return []
+    elsewhere = [
+        route.uav.id for route in plan.routes if route.length_m > 0 and not np.allclose(route.points[0], depot, 0, 1e-7)
+    ]
+    if not elsewhere:
+        return []
+    return [
+        f"Autopilots count altitudes from where they are armed. If that is where the route begins and not the depot "
+        f"({named(elsewhere)}), and the ground is not as high there, altitudes and the steps between UAVs are off by as much."
     ]
 
 
