@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -16,6 +17,10 @@ import pytest
 from web_server import Served, problem, served
 
 from sb3_uav.cli.main import main
+from sb3_uav.envs.schedule import Schedule
+from sb3_uav.missions.fleet import Fleet
+from sb3_uav.missions.search import make_plan
+from sb3_uav.missions.tasks import TaskList
 
 for module in ("fastapi", "uvicorn", "pyproj", "plotly", "matplotlib", "numba"):
     pytest.importorskip(module)
@@ -44,8 +49,14 @@ def test_a_solve_from_tasks_to_a_zip(server: Served):
     found = server.wait(name)
     assert (found["state"], found["error"], found["place"]) == ("done", None, None)
     assert found["objective"] == found["history"][-1][1] > 0
+    from sb3_uav.web.answers import PlanOut
+
     plan = server.ask("GET", f"/api/v1/solves/{name}/plan").json
     assert plan["mission"]["format"] == "sb3-uav mission"
+    report = PlanOut.model_validate(plan).report.model_dump()
+    # Nothing is undescribed.
+    assert set(report) == set(plan["report"])
+    assert set(report["routes"][0]) == set(plan["report"]["routes"][0])
     report = plan["report"]
     assert report["objective"] == found["objective"]
     assert [route["stops"] for route in report["routes"]] == plan["mission"]["routes"]
@@ -162,7 +173,7 @@ def test_old_solves_are_dropped(server: Served):
         (changed(tasks__tasks__0__id="t1"), "tasks: task 2 has the id 't1' of an earlier task; ids must differ."),
         (changed(tasks__tasks__0__id="a\0"), "tasks.tasks.0.id: this has control characters; leave them out."),
         (changed(tasks__tasks__0__value="1"), "tasks.tasks.0.value: Input should be a valid number."),
-        (changed(tasks__tasks__0__service_s=4), "Task 't0' takes time, but UAV 'uav-1' has no speed."),
+        (changed(tasks__tasks__0__service_s=4), "Task 't0' takes time, but UAV 'uav-1' has no speed; give it one."),
         (
             changed(tasks__tasks__0__point=[1]),
             "tasks.tasks.0.point: List should have at least 2 items after validation, not 1.",
@@ -233,13 +244,27 @@ def test_bodies_are_measured_while_they_come_in(server: Served):
     assert server.ask("GET", "/api/v1/limits").status == 200
 
 
+def test_bound_and_gap_are_reported():
+    from sb3_uav.web.plan_view import report_of
+
+    tasks = TaskList.of("ab", [[3, 4], [6, 8]], "plane", [1, 2], depot=(0, 0))
+    plan = make_plan(tasks, Fleet.of_equal(1, 12.0), Schedule([[0]]), "by hand")
+    assert [report_of(plan)[key] for key in ("bound", "gap")] == [None, None]
+    report = report_of(dataclasses.replace(plan, bound=2.0), ["c"])
+    assert (report["bound"], report["gap"], report["objective"]) == (2.0, 0.5, 1.0)
+    assert [one["text"] for one in report["skipped"]] == ["out of reach: 8 m of range are missing", "forbidden by you"]
+    assert "unserved" in report and report["remarks"] and not any("--" in remark for remark in report["remarks"])
+
+
 def test_requests_of_the_docs(server: Served):
     text = (Path(__file__).parents[1] / "docs" / "serve.md").read_text(encoding="utf-8")
-    commands = [shlex.split(command) for command in re.findall(r"^curl .*?(?=^curl |```)", text, re.MULTILINE | re.DOTALL)]
+    (problem_json,) = re.findall(r"^```json\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    files = {"@problem.json": problem_json.encode(), "@field.csv": b"id,x,y,depot\nd,0,0,yes\na,10,10,\n"}
+    commands = [shlex.split(line) for line in re.findall(r"^curl .*", text, re.MULTILINE)]
     assert len(commands) == 2
     for words in commands:
         (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
-        body = words[words.index("-d") + 1].encode() if "-d" in words else b"id,x,y,depot\nd,0,0,yes\na,10,10,\n"
+        body = files[words[-1]]
         answer = server.ask("POST", url.removeprefix("http://127.0.0.1:8080"), body, {"content-type": "application/json"})
         assert answer.status == 202, answer
         found = server.wait(answer.json["id"], "running", "done", with_plan=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from web_server import Served, problem, served
 
 from sb3_uav.cli.main import main
 from sb3_uav.cli.serve import _checked_tiles, _checked_token
+from sb3_uav.web.workers import send_message
 
 for module in ("fastapi", "uvicorn", "pyproj", "numba"):
     pytest.importorskip(module)
@@ -62,6 +64,7 @@ def test_login_gives_a_cookie_that_scripts_cannot_read(server: Served):
         ({"origin": "http://evil.example"}, 403),
         ({"origin": "http://127.0.0.1:1"}, 403),
         ({"origin": "null"}, 403),
+        ({"origin": "http://["}, 403),
         ({"sec-fetch-site": "cross-site"}, 403),
         ({"sec-fetch-site": "same-site"}, 403),
         ({"host": "evil.example"}, 421),
@@ -193,6 +196,37 @@ def test_without_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["serve", "--port", "0"]) == 2
     assert "[web]" in capsys.readouterr().err
+
+
+def test_workers_that_cannot_start_are_explained(monkeypatch):
+    from sb3_uav.web import jobs
+    from sb3_uav.web.jobs import Job, Pool
+
+    class Broken:
+        """A worker that says what it lacks, and ends."""
+
+        def __init__(self):
+            self.connection, theirs = multiprocessing.Pipe()
+            send_message(theirs, {"event": "broken", "error": "numba is missing"}, [])
+            theirs.close()
+            self.waitable = [self.connection]
+
+        def end(self):
+            self.connection.close()
+
+    monkeypatch.setattr(jobs, "Worker", Broken)
+    pool = Pool(1, 4, 4, "solves")
+    job = pool.submit(Job({}, [], 1.0))
+    pool.open()
+    try:
+        until = time.monotonic() + 20
+        while pool.start_error is None and time.monotonic() < until:
+            time.sleep(0.01)
+        assert pool.start_error == "numba is missing"
+        assert (job.state, pool.is_ready) == ("waiting", False)
+    finally:
+        pool.close()
+    assert job.state == "canceled"
 
 
 def family(pid: int) -> list[int]:

@@ -17,7 +17,8 @@ from sb3_uav.web.limits import Limits
 if TYPE_CHECKING:
     from sb3_uav.web.api import Rooms
 
-_PATIENCE = 120.0
+# Where nothing is compiled yet, the first server takes a minute or two.
+_PATIENCE = 300.0
 JSON = {"content-type": "application/json"}
 
 

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 
 import anyio
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
-from pydantic import Field
 
 import sb3_uav
+from sb3_uav.web.answers import FileFleet, FileTasks, PlanOut, Progress
 from sb3_uav.web.jobs import PARTS, BusyError, Job, Pool
 from sb3_uav.web.limits import MOST_UAVS, Limits
-from sb3_uav.web.schemas import FleetIn, FlightIn, OptionsIn, Progress, SolveIn, Strict, TasksIn, check_text
+from sb3_uav.web.schemas import FleetIn, FlightIn, OptionsIn, SolveIn, TasksIn, check_text
 
 SOLVERS = {"default": None, "local-search": "local-search", "insertion": "greedy-insertion"}
 # A solve may take this much longer than its time limit: the networks look at no clock.
@@ -33,19 +33,6 @@ _ERRORS: dict[int | str, dict[str, Any]] = {
         429: "Too many solves wait",
     }.items()
 }
-
-
-class Refusal(Strict):
-    """What every error says."""
-
-    detail: str = Field(description="One sentence")
-
-
-class FileTasks(TasksIn):
-    """The tasks of a file, its fleet if it has one, and what else the file says."""
-
-    notes: list[str] = Field(default=[])
-    uavs: list[dict[str, Any]] | None = None
 
 
 class Rooms:
@@ -168,7 +155,10 @@ class Rooms:
             (len(uavs) > limits.max_uavs, f"This server admits {limits.max_uavs} UAVs at most."),
             (options.time_limit > limits.max_seconds, f"This server solves for {limits.max_seconds:g} s at most."),
             (given.tasks.depot is None, "There is no depot; say where the UAVs start and land."),
-            (first_timed and slow, f"Task {first_timed and first_timed.id!r} takes time, but UAV {slow!r} has no speed."),
+            (
+                first_timed and slow,
+                f"Task {first_timed and first_timed.id!r} takes time, but UAV {slow!r} has no speed; give it one.",
+            ),
         ):
             if is_wrong:
                 raise HTTPException(422, sentence)
@@ -208,7 +198,7 @@ def api_router(rooms: Rooms) -> APIRouter:
         """Read a file of tasks: CSV, GeoJSON, QGroundControl plan, WPL, Chao, OPLib, npz, or a mission.json of ours."""
         return _json(await rooms.read_tasks(name, await request.body(), unit, allow_duplicates))
 
-    @api.post("/fleets", openapi_extra=_RAW)
+    @api.post("/fleets", response_model=FileFleet, openapi_extra=_RAW)
     async def read_fleet(request: Request, name: FileName) -> Response:
         """Read a CSV of UAVs."""
         return _json(await rooms.read_fleet(name, await request.body()))
@@ -246,7 +236,7 @@ def api_router(rooms: Rooms) -> APIRouter:
         """Where a solve stands."""
         return rooms.progress(rooms.find(name))
 
-    @api.get("/solves/{name}/plan")
+    @api.get("/solves/{name}/plan", response_model=PlanOut)
     def plan(name: SolveId) -> Response:
         """The best plan so far: ``mission`` as in mission.json, and ``report`` with lengths and reasons."""
         return _json(b'{"mission": ' + rooms.part(name, "mission") + b', "report": ' + rooms.part(name, "report") + b"}")

@@ -19,7 +19,8 @@ from fastapi.staticfiles import StaticFiles
 from pydantic import Field, ValidationError
 
 import sb3_uav
-from sb3_uav.web.api import Refusal, Rooms, api_router
+from sb3_uav.web.answers import Refusal
+from sb3_uav.web.api import Rooms, api_router
 from sb3_uav.web.guard import Guard, Keys, cookie_of
 from sb3_uav.web.limits import Limits
 from sb3_uav.web.schemas import Draft, Strict, sentence_of

@@ -235,7 +235,10 @@ def _is_same_origin(headers: dict[str, str], host: str) -> bool:
     """Browsers say where a request comes from; programs that are none need not."""
     origin = headers.get("origin")
     if origin is not None:
-        return urlsplit(origin).netloc.lower() == host.lower() if origin != "null" else False
+        try:
+            return urlsplit(origin).netloc.lower() == host.lower()
+        except ValueError:
+            return False
     return headers.get("sec-fetch-site", "none") in ("same-origin", "none")
 
 

@@ -199,8 +199,11 @@ class Pool:
             ready = wait(worker.waitable, _TICK)
             if worker.connection in ready:
                 try:
-                    receive_message(worker.connection)
+                    message, _ = receive_message(worker.connection)
                 except (EOFError, OSError):
+                    break
+                if message["event"] != "ready":
+                    self.start_error = message["error"]
                     break
                 self._ready[slot] = True
                 self.start_error, self._pause = None, 1.0
@@ -208,7 +211,7 @@ class Pool:
             if ready:
                 break
         if not self._closed:
-            self.start_error = "A worker ended while it was started; see the output of the server."
+            self.start_error = self.start_error or "A worker ended while it was started; see the output of the server."
             self._wait_longer()
         self._stop(slot, worker)
         return None

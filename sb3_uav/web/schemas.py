@@ -166,22 +166,6 @@ class Draft(Strict):
         return self
 
 
-class Progress(BaseModel):
-    """Where a solve stands."""
-
-    id: str
-    state: Literal["waiting", "running", "done", "failed", "canceled"]
-    place: int | None = Field(description="Solves before this one in the queue; null when it does not wait")
-    error: str | None = Field(description="One sentence, when it failed or cannot start")
-    version: int = Field(description="Grows with every change")
-    elapsed_s: float
-    time_limit: float
-    has_plan: bool
-    objective: float | None
-    history: list[tuple[float, float]] = Field(description="Seconds and value of the plans so far")
-    ready: bool = Field(description="False while the workers are being started")
-
-
 def check_text(text: str, what: str) -> None:
     """
     :param text: Text of the user

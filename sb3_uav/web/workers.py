@@ -97,9 +97,15 @@ def _main(connection: Connection) -> None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     from sb3_uav.web.work import do, warm
 
-    warm()
-    _limit_memory()
     try:
+        try:
+            warm()
+        except Exception as error:
+            # The server repeats it to everybody who waits.
+            text = f"The solver cannot be started: {type(error).__name__}: {' '.join(str(error).split())[:500]}"
+            send_message(connection, {"event": "broken", "error": text}, [])
+            return
+        _limit_memory()
         send_message(connection, {"event": "ready"}, [])
         while True:
             request, blocks = receive_message(connection)
