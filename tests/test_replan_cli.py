@@ -108,8 +108,9 @@ def test_what_must_be_served_and_is_not_is_a_failure(mission, capsys):
         ("uav,north,8,47,500\n", ["mission"], "row 2: 8, 47 is"),
         ("uav,north,8,47,500\n", ["mission"], "lat and lon look swapped."),
         ("lost,north\nlost,south\n", ["mission"], "all 2 UAVs are lost; nobody is left to fly"),
-        ("lost,north\n", ["nowhere"], "No such file or directory"),
-        ("lost,north\n", ["status.csv"], "status.csv: this is not JSON"),
+        ("lost,north\n", ["nowhere"], "nowhere: this is no mission; name the folder that sb3-uav solve has written"),
+        ("lost,north\n", ["."], "this is no mission; name the folder"),
+        ("lost,north\n", ["status.csv"], "status.csv: this is no mission"),
         ("lost,north\n", ["mission", "-o", "mission"], "a replan does not change the mission that it starts from"),
         ("lost,north\n", ["mission", "-o", "."], "this folder holds other files"),
         ("lost,north\n", ["mission", "--min-gain", "nan"], "min_gain is nan"),
@@ -123,6 +124,11 @@ def test_errors_write_nothing(mission, capsys, status, arguments, message):
     assert message in error
     assert {path.name for path in Path().iterdir()} == {"mission", "status.csv"}
     assert {path.name for path in mission.iterdir()} == {"mission.json"}
+
+
+def test_a_status_that_is_not_there(mission, capsys):
+    assert main(["replan", "mission", "--status", "today.csv"]) == 2
+    assert "today.csv: there is no such file; --status names a CSV" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -132,8 +132,15 @@ def main(argv: Sequence[str]) -> int:
     for package in ("matplotlib", "plotly"):
         require(package, "The map of a mission", "missions")
     require("numba", "Replanning", "missions")
+    path = folder / PLAN_FILE if args.mission.is_dir() else args.mission
+    if not path.is_file() or path.suffix.lower() != ".json":
+        raise ValueError(
+            f"{args.mission}: this is no mission; name the folder that sb3-uav solve has written, with {PLAN_FILE}."
+        )
+    if not args.status.is_file():
+        raise ValueError(f"{args.status}: there is no such file; --status names a CSV that says what has happened.")
     check_folder(new_folder, args.overwrite)
-    plan = load_plan(folder / PLAN_FILE if args.mission.is_dir() else args.mission)
+    plan = load_plan(path)
     status = read_status(args.status)
     from sb3_uav.local_search.search import warm_up
 
