@@ -69,6 +69,23 @@ def test_delimiters_line_ends_and_byte_order_marks(delimiter, end, mark):
     assert tasks.places == ("row 2", "row 4")
 
 
+def test_a_note_says_that_nothing_is_named():
+    (note,) = read("iata,lat,long\nORD,41.98,-87.9\nSFO,37.6,-122.4\n").notes
+    assert "the tasks are called 1, 2, ..." in note
+    assert read("name,lat,long\nORD,41.98,-87.9\n").notes == ()
+
+
+def test_tasks_that_are_near_the_depot_once_swapped():
+    text = "id,lat,lon\na,8.55,47.39\nb,8.56,47.4\n"
+    assert refusal(text, depot="47.4,8.5").startswith(
+        "row 2: lat, lon are 8.55, 47.39, but the depot is at 47.4, 8.5: latitude and longitude look swapped"
+    )
+    assert "look swapped" in refusal("id,lat,lon,depot\nhome,47.4,8.5,yes\na,8.55,47.39,\n")
+    # Far away all the same, near already, or no depot: nothing is known of a mistake.
+    assert len(read(text, depot="60,8.5")) == len(read(text, depot="8.5,47.4")) == len(read(text)) == 2
+    assert len(read("id,lat,lon\na,45,46\n", depot="46,45")) == 1
+
+
 def test_a_spreadsheet_with_decimal_commas():
     tasks = read("sep=;\r\nid;type;lat;lon;priority\r\nhof;Depot;47,5;8,5;\r\nbaum;tree;47,51;-8,5;1e2\r\n")
     assert tasks.depot.tolist() == [47.5, 8.5]
@@ -257,7 +274,12 @@ def task_lists(draw):
     )
 
 
-@given(task_lists())
+def is_in_order(tasks):
+    """Whether the depot is not where the tasks would be with latitude and longitude swapped, which is refused."""
+    return tasks.depot is None or (np.abs(tasks.points[:, ::-1] - tasks.depot) > 2).any()
+
+
+@given(task_lists().filter(is_in_order))
 def test_round_trip(tasks):
     check_tasks(tasks, allow_duplicates=True)
     again = read(tasks_to_csv(tasks), allow_duplicates=True)

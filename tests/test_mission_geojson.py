@@ -81,7 +81,13 @@ def test_third_coordinates_are_not_flown_and_a_note_says_so():
     tasks = read(collection(feature(8, 47, 30.5), feature(8, 48, 0), feature(8, 49, 400, alt=25)))
     assert tasks.altitudes.tolist() == pytest.approx([np.nan, np.nan, 25], nan_ok=True)
     assert "not flown" in tasks.notes[0]
-    assert read(collection(feature(8, 48, 0), feature(8, 49, 400, alt=25))).notes == ()
+    assert read(collection(feature(8, 48, 0, id="a"), feature(8, 49, 400, alt=25))).notes == ()
+
+
+def test_a_note_says_that_nothing_is_named():
+    (note,) = read(collection(feature(), feature(9, 48, OBJECTID=4))).notes
+    assert "the tasks are called 1, 2, ..." in note
+    assert read(collection(feature(name="a"), feature(9, 48))).notes == ()
 
 
 @pytest.mark.parametrize("flag", [1, 1.0, True])
@@ -111,7 +117,7 @@ def shaped(kind, coordinates):
         (collection(shaped("Point", [8, "47"])), "feature 1: coordinate 2 is '47'"),
         (collection(shaped("Point", [8, 10**400])), "feature 1: coordinate 2 is 1000"),
         (collection(feature(value=-1)), "feature 1: value is -1; write 0 or more"),
-        (collection(feature(priority="high")), "feature 1: value is 'high'"),
+        (collection(feature(priority="high")), "feature 1: priority is 'high'"),
         (collection(feature(value=True)), "feature 1: value is true"),
         (collection(feature(service_s=-0.5)), "feature 1: service_s is -0.5"),
         (collection(feature(must="yes")), "feature 1: must is 'yes'; write true or false"),
@@ -123,13 +129,21 @@ def shaped(kind, coordinates):
         (collection(feature(), feature(depot=True), feature(depot=True)), "feature 3: this is the second depot"),
         (collection(feature(depot=True)), "there are no tasks"),
         (collection(), "there are no tasks"),
-        (collection(feature(), crs={"type": "name", "properties": {"name": "EPSG:3857"}}), "crs is 'EPSG:3857'"),
+        (
+            collection(feature(), crs={"type": "name", "properties": {"name": "EPSG:3857"}}),
+            "crs is 'EPSG:3857'; export .* \\(CRS84\\)\\.$",
+        ),
+        (
+            collection(feature(), crs={"properties": {"name": "urn:ogc:def:crs:EPSG::4326"}}),
+            ".*CRS84.*, or delete crs if long",
+        ),
         (collection(feature(), crs=None), "crs is null"),
         (collection(feature(), crs={"properties": []}), "crs is"),
         (collection(feature(), sb3_uav_plane={"meters_per_unit": 0}), "meters_per_unit of sb3_uav_plane is 0"),
         (collection(feature(), sb3_uav_plane=None), "meters_per_unit of sb3_uav_plane is null"),
         ({"type": "Point", "coordinates": [8, 47]}, "type is 'Point'; write a FeatureCollection"),
         ({"type": "FeatureCollection"}, "features is null"),
+        ({"items": [], "plannedHomePosition": [47, 8, 0]}, "this is a mission of an old QGroundControl"),
         ([feature()], "there is .* where an object of JSON is expected"),
     ],
 )

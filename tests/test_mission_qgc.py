@@ -84,8 +84,10 @@ def test_items_that_are_tasks(tasks):
     assert tasks.service_s.tolist() == [16.5, 1, 30, 0]
     assert tasks.altitudes.tolist() == pytest.approx([60, np.nan, np.nan, 70], nan_ok=True)
     assert tasks.values.tolist() == [1] * 4
-    (note,) = tasks.notes
-    for part in ("MAV_CMD 178 (1)", "MAV_CMD 206 (1)", "without a position (1)", "not relative to home (1)"):
+    lost, note = tasks.notes
+    assert "above the sea or the terrain (1, 400 m)" in lost
+    assert "flown at the altitude of the UAV above the depot" in lost
+    for part in ("MAV_CMD 178 (1)", "MAV_CMD 206 (1)", "without a position (1)"):
         assert part in note
 
 
@@ -107,6 +109,17 @@ def test_what_comes_after_the_start_of_the_landing_is_no_task():
     assert "a waypoint of the landing (1)" in tasks.notes[0]
     landing = {"type": "ComplexItem", "complexItemType": "fwLandingPattern"}
     assert "landing pattern" in read(plan(item(16, 47, 8, 50), landing)).notes[0]
+
+
+def test_positions_beside_four_params_as_old_versions_wrote_them():
+    old = {**item(16, 12, 0, 0, None, 0, 0, 0), "params": [12, 0, 0, None], "coordinate": [47.1, 8.1, 20]}
+    tasks = read(plan(old, geoFence={"polygon": [], "version": 1}))
+    assert (tasks.points.tolist(), tasks.service_s.tolist(), tasks.altitudes.tolist()) == ([[47.1, 8.1]], [12], [20])
+    # Later ones have both, of which the seven count.
+    assert read(plan({**OK, "coordinate": [1, 2, 3]})).points.tolist() == [[47, 8]]
+    for wrong in ([47.1, 8.1], "47.1", None):
+        with pytest.raises(ValueError, match=r"item 1: params is \[12, 0, 0, null\]; write a list of 7 numbers"):
+            read(plan({**old, "coordinate": wrong}))
 
 
 @pytest.mark.parametrize("home", [None, [None, None, None], [0, 0, 0], [0.0, 0.0]])

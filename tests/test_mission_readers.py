@@ -64,6 +64,7 @@ def test_csv_by_its_suffix(name):
     ("name", "data", "message"),
     [
         ("t", CSV, "t: files that end in 'nothing' are not read, but .csv .tsv .txt .geojson"),
+        ("t.mission", b"{}", "t.mission: files that end in '.mission' are not read, .* save it as .plan"),
         ("t.xlsx", b"PK\x03\x04", "t.xlsx: files that end in '.xlsx' are not read, .* save the sheet as CSV"),
         ("t.kml", b"<kml/>", "t.kml: files that end in '.kml' are not read, .* convert it to GeoJSON or CSV"),
         ("t.pkl", b"\x80\x04", "t.pkl: files that end in '.pkl' are not read"),

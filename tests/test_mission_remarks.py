@@ -190,3 +190,51 @@ def test_names_that_are_too_many_or_hostile() -> None:
 
 def test_notes_of_the_file_are_told() -> None:
     assert "Mind the height." in remarks_on(plan_of([(1, 0)], [[0]], notes=("Mind the height.",)))
+
+
+def test_altitudes_of_stops_that_replace_the_option_are_told() -> None:
+    plan = plan_of([(1, 0), (2, 0), (3, 0)], [[0, 1]], altitudes=np.array([3, 20, 7]))
+    (remark,) = [remark for remark in remarks_on(plan, FlightOptions()) if "--altitude says" in remark]
+    assert remark.startswith("The file says the altitude of 2 of 2 stops: 3 to 20 m above the depot")
+    level = plan_of([(1, 0), (2, 0)], [[0, 1]], altitudes=np.array([3, np.nan]))
+    assert any("altitude of 1 of 2 stops: 3 m above" in remark for remark in remarks_on(level, FlightOptions()))
+    assert not any("--altitude says" in remark for remark in remarks_on(plan_of([(1, 0)], [[0]]), FlightOptions()))
+
+
+def test_fixed_wings_need_a_takeoff_and_a_landing() -> None:
+    tasks = TaskList.of(["a"], [(47.01, 8.0)], "wgs84", depot=(47.0, 8.0))
+    plan = make_plan(tasks, Fleet.of_equal(1, 1e5), Schedule([[0]]), "by hand")
+
+    def told(**options: Any) -> list[str]:
+        return [remark for remark in remarks_on(plan, FlightOptions(**options)) if "Fixed wings" in remark]
+
+    assert told() == []
+    assert "may circle at home and not land" in told(vehicle="fixed-wing")[0]
+    assert "land without an approach" in told(vehicle="fixed-wing", landing="land")[0]
+
+
+def test_the_way_home_is_flown_at_the_altitude_of_the_last_stop() -> None:
+    # Home from (100, 50), over the way of the first UAV from (50, -50) to (50, 50), 10 m and 30 m below.
+    stops = [(50, -50), (50, 50), (100, 50)]
+    nan = np.nan
+    assert crossing_legs(plan_of(stops, [[0, 1], [2]], altitudes=np.array([nan, nan, 50])), FlightOptions()) == [
+        ((0, 1), (1, 1))
+    ]
+    assert crossing_legs(plan_of(stops, [[0, 1], [2]], altitudes=np.array([nan, nan, 20])), FlightOptions()) == []
+
+
+def test_returns_from_stops_with_altitudes_of_their_own() -> None:
+    tasks = TaskList.of("ab", [(47.01, 8.0), (46.99, 8.0)], "wgs84", depot=(47.0, 8.0), altitudes=np.array([np.nan, 3]))
+    plan = make_plan(tasks, Fleet.of_equal(2, 1e5), Schedule([[0], [1]]), "by hand")
+    (remark,) = [remark for remark in remarks_on(plan, FlightOptions()) if "RTL_RETURN_ALT" in remark]
+    assert remark.startswith("UAVs return at the altitude of their last stop (uav-2 at 3 m), or at that of their autopilot")
+
+
+def test_altitudes_count_from_where_a_uav_is_armed() -> None:
+    def told(start: tuple[float, float] | None) -> list[str]:
+        tasks = TaskList.of(["a"], [(47.01, 8.0)], "wgs84", depot=(47.0, 8.0))
+        plan = make_plan(tasks, Fleet((Uav("hill", 1e5, start=start),)), Schedule([[0]]), "by hand")
+        return [remark for remark in remarks_on(plan, FlightOptions()) if "armed" in remark]
+
+    assert told(None) == told((47.0, 8.0)) == []
+    assert "not the depot (hill)" in told((47.02, 8.0))[0]

@@ -250,8 +250,20 @@ def test_stops_are_numbered_where_there_is_room() -> None:
     crowd = [(500 + 0.1 * n, 0.0) for n in range(100)]
     crowded = numbers_on(plane_plan([*crowd, (1000, 1000)]))
     assert 2 <= len(crowded) < 10 and {"1", "101"} <= set(crowded)
-    # Nor over the depot.
-    assert numbers_on(plane_plan([(0, 1), (1000, 1000)])) == ["2"]
+
+
+def test_numbers_have_other_places_beside_a_neighbor_or_the_depot() -> None:
+    # Some 8 points between the pair, and 580 for the whole width.
+    pair = plane_plan([(1000, 500), (985, 500)])
+    assert sorted(numbers_on(pair)) == ["1", "2"]
+    aligned = {text.get_text(): text.get_ha() for text in map_figure(pair).axes[0].texts}
+    assert (aligned["1"], aligned["2"]) == ("left", "right")
+    # Not over the depot, but below it.
+    near = next(text for text in map_figure(plane_plan([(0, -1), (1000, 1000)])).axes[0].texts if text.get_text() == "1")
+    assert near.get_va() == "top"
+    # None at all between stops on every side.
+    grid = [(10.0 * x, 10.0 * y) for x in range(-3, 4) for y in range(-3, 4)]
+    assert len(numbers_on(plane_plan([*((500 + x, 500 + y) for x, y in grid), (2000, 2000)]))) < 20
 
 
 def test_the_picture_is_true_to_scale() -> None:

@@ -70,6 +70,19 @@ def test_a_mission_in_the_air(mission, capsys):
     assert again.past_tasks == plan.past_tasks
 
 
+def test_routes_are_kept_for_a_small_gain(mission, capsys):
+    # The UAV serves one task, and the new one is worth a little more.
+    fleet = Fleet((Uav("a", 5_000.0),))
+    tasks = TaskList.of(["n1", "s1"], [(47.02, 8.0), (46.98, 8.0)], "wgs84", [100, 1], depot=(47.0, 8.0))
+    save_plan(make_plan(tasks, fleet, Schedule([[0]]), "by hand"), mission / "mission.json")
+    status = "task,new,46.98,8.001,,103,,\n"
+    assert replan(status, "mission") == 0
+    assert "1 of 3 tasks served, value 100 of 204" in capsys.readouterr().out
+    assert replan(status, "mission", "--min-gain", "0") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "for a value of 104 in place of 100; --min-gain asks for more." in printed
+
+
 def test_how_it_is_flown_stays(mission):
     from sb3_uav.missions.write import write_mission
 
@@ -95,8 +108,9 @@ def test_what_must_be_served_and_is_not_is_a_failure(mission, capsys):
         ("uav,north,8,47,500\n", ["mission"], "row 2: 8, 47 is"),
         ("uav,north,8,47,500\n", ["mission"], "lat and lon look swapped."),
         ("lost,north\nlost,south\n", ["mission"], "all 2 UAVs are lost; nobody is left to fly"),
-        ("lost,north\n", ["nowhere"], "No such file or directory"),
-        ("lost,north\n", ["status.csv"], "status.csv: this is not JSON"),
+        ("lost,north\n", ["nowhere"], "nowhere: this is no mission; name the folder that sb3-uav solve has written"),
+        ("lost,north\n", ["."], "this is no mission; name the folder"),
+        ("lost,north\n", ["status.csv"], "status.csv: this is no mission"),
         ("lost,north\n", ["mission", "-o", "mission"], "a replan does not change the mission that it starts from"),
         ("lost,north\n", ["mission", "-o", "."], "this folder holds other files"),
         ("lost,north\n", ["mission", "--min-gain", "nan"], "min_gain is nan"),
@@ -110,6 +124,11 @@ def test_errors_write_nothing(mission, capsys, status, arguments, message):
     assert message in error
     assert {path.name for path in Path().iterdir()} == {"mission", "status.csv"}
     assert {path.name for path in mission.iterdir()} == {"mission.json"}
+
+
+def test_a_status_that_is_not_there(mission, capsys):
+    assert main(["replan", "mission", "--status", "today.csv"]) == 2
+    assert "today.csv: there is no such file; --status names a CSV" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ STATUS.csv, for example (x and y in place of lat and lon for a plane):
   row, a UAV is where its route begins.
 
 The rest of every route keeps its order. Stops that the range no longer admits are left out, and free and new tasks are put
-between the others. Routes change further only if that serves more tasks that must be served, or a larger value. The reserve
-of a UAV stays the same in meters.
+between the others. Routes change further only if that serves more tasks that must be served, or adds --min-gain to the
+value. The reserve of a UAV stays the same in meters.
 
 A replan starts from the newest plan: for the next one, name the folder that this one has written. A status file may grow
 during a mission; what an earlier replan has taken in does no harm. OUT is never changed.
@@ -62,9 +62,10 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--min-gain",
         type=float,
-        default=0.0,
+        # Pilots in the air are not given new routes for a task of many.
+        default=5.0,
         metavar="PERCENT",
-        help="value that changing routes further has to add (default: %(default)g)",
+        help="value that changing routes further has to add; 0 for the most value (default: %(default)g)",
     )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     add_flight_options(parser)
@@ -131,8 +132,15 @@ def main(argv: Sequence[str]) -> int:
     for package in ("matplotlib", "plotly"):
         require(package, "The map of a mission", "missions")
     require("numba", "Replanning", "missions")
+    path = folder / PLAN_FILE if args.mission.is_dir() else args.mission
+    if not path.is_file() or path.suffix.lower() != ".json":
+        raise ValueError(
+            f"{args.mission}: this is no mission; name the folder that sb3-uav solve has written, with {PLAN_FILE}."
+        )
+    if not args.status.is_file():
+        raise ValueError(f"{args.status}: there is no such file; --status names a CSV that says what has happened.")
     check_folder(new_folder, args.overwrite)
-    plan = load_plan(folder / PLAN_FILE if args.mission.is_dir() else args.mission)
+    plan = load_plan(path)
     status = read_status(args.status)
     from sb3_uav.local_search.search import warm_up
 

@@ -66,7 +66,9 @@ class _Legs:
         plane = plan.tasks.coordinates().to_plane(route.points)
         own = flight.altitude_of(plan.fleet.level_of(uav))
         wanted = plan.tasks.altitudes[list(route.stops)]
-        altitudes = np.array([own, *np.where(np.isnan(wanted), own, wanted), own])
+        at_stops = np.where(np.isnan(wanted), own, wanted)
+        # It flies home at the altitude of its last stop, whether it returns or is sent to land.
+        altitudes = np.array([own, *at_stops, *(at_stops[-1:] if len(at_stops) else [own])])
         points = np.column_stack([plane, altitudes])
         flown = route.legs_m > 0
         return cls(points[:-1][flown], points[1:][flown], plane[[0, -1]])

@@ -43,6 +43,7 @@ SUFFIXES: dict[str, tuple[Format, ...]] = {
 }
 _ADVICE = {
     **dict.fromkeys((".xlsx", ".xls", ".ods"), "save the sheet as CSV (UTF-8)"),
+    ".mission": "open it in QGroundControl and save it as .plan",
     **dict.fromkeys((".kml", ".kmz", ".gpx", ".shp", ".gpkg"), "convert it to GeoJSON or CSV"),
 }
 _IS_PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"')

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_uav.missions.crossings import SEPARATION_M, find_crossings
 from sb3_uav.missions.flight import FlightOptions
-from sb3_uav.missions.labels import position, shown
+from sb3_uav.missions.labels import count, position, shown
 from sb3_uav.missions.plan import Plan
 
 REVIEW = "A person must review this plan before it is flown. Wind, terrain, obstacles and no-fly zones are not modeled."
@@ -30,6 +30,7 @@ def remarks_on(plan: Plan, flight: FlightOptions | None = None) -> tuple[str, ..
     remarks = [*plan.notes, *_of_tasks(plan), *plan.tasks.notes, *_of_fleet(plan), *_of_lengths(plan), *_of_launches(plan)]
     if flight is not None:
         remarks += [*_of_crossings(plan, flight), *_of_altitudes(plan, flight), *_of_return(plan, flight)]
+        remarks += _of_fixed_wings(plan, flight)
     return (*remarks, REVIEW)
 
 
@@ -119,16 +120,51 @@ def _of_crossings(plan: Plan, flight: FlightOptions) -> list[str]:
         return []
     ids = [uav.id for uav in plan.fleet]
     pairs = dict.fromkeys(f"{ids[crossing.uavs[0]]} with {ids[crossing.uavs[1]]}" for crossing in crossings)
-    count = "1 pair of legs crosses" if len(crossings) == 1 else f"{len(crossings)} pairs of legs cross"
+    found = "1 pair of legs crosses" if len(crossings) == 1 else f"{len(crossings)} pairs of legs cross"
     advice = (
         f"--altitude-step {2 * SEPARATION_M:g} keeps the UAVs apart"
         if flight.altitude_step_m < SEPARATION_M
         else "tasks with altitudes of their own bring UAVs to one level"
     )
-    return [f"At one altitude (less than {SEPARATION_M:g} m apart) {count}: {named(list(pairs))}; {advice}."]
+    return [f"At one altitude (less than {SEPARATION_M:g} m apart) {found}: {named(list(pairs))}; {advice}."]
 
 
 def _of_altitudes(plan: Plan, flight: FlightOptions) -> list[str]:
+    return [*_of_own_altitudes(plan), *_of_other_launches(plan), *_of_high_ones(plan, flight)]
+
+
+def _of_own_altitudes(plan: Plan) -> list[str]:
+    """A file of a ground station has an altitude for every waypoint, of which nobody may think when saying --altitude."""
+    served = [task for route in plan.routes for task in route.stops]
+    own = plan.tasks.altitudes[served]
+    own = own[~np.isnan(own)]
+    if len(own) == 0:
+        return []
+    low, high = own.min(), own.max()
+    span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return [
+        f"The file says the altitude of {len(own)} of {count(len(served), 'stop')}: {span} m above the depot, whatever "
+        f"--altitude says; the legs between them are flown at these, too."
+    ]
+
+
+def _of_other_launches(plan: Plan) -> list[str]:
+    """Altitudes of autopilots count from home, which is where they were armed."""
+    depot = plan.tasks.depot
+    if plan.tasks.system != "wgs84" or depot is None:
+        return []
+    elsewhere = [
+        route.uav.id for route in plan.routes if route.length_m > 0 and not np.allclose(route.points[0], depot, 0, 1e-7)
+    ]
+    if not elsewhere:
+        return []
+    return [
+        f"Autopilots count altitudes from where they are armed. If that is where the route begins and not the depot "
+        f"({named(elsewhere)}), and the ground is not as high there, altitudes and the steps between UAVs are off by as much."
+    ]
+
+
+def _of_high_ones(plan: Plan, flight: FlightOptions) -> list[str]:
     high = []
     for number, route in enumerate(plan.routes):
         if route.flies:
@@ -148,9 +184,31 @@ def _of_return(plan: Plan, flight: FlightOptions) -> list[str]:
     flying = [number for number, route in enumerate(plan.routes) if route.flies]
     if plan.tasks.system != "wgs84" or flight.landing != "rtl" or len(flying) < 2:
         return []
+    last = {number: plan.tasks.altitudes[plan.routes[number].stops[-1]] for number in flying if plan.routes[number].stops}
     name = "RTL_RETURN_ALT" if flight.firmware == "px4" else "RTL_ALT"
+    own = {number: altitude for number, altitude in last.items() if not np.isnan(altitude)}
+    if own:
+        names = named([f"{plan.routes[number].uav.id} at {altitude:g} m" for number, altitude in own.items()])
+        return [
+            f"UAVs return at the altitude of their last stop ({names}), or at that of their autopilot ({name}) where it is "
+            f"higher: see that nothing is in their way, and that they do not come back at once."
+        ]
     lowest = min(flight.altitude_of(plan.fleet.level_of(number)) for number in flying)
     return [
         f"UAVs below the return altitude of their autopilot ({name}) climb to it on the way back; set it to {lowest:g} m or "
         f"less, or their legs home are at one altitude."
+    ]
+
+
+def _of_fixed_wings(plan: Plan, flight: FlightOptions) -> list[str]:
+    """
+    What depends on the site: see https://docs.px4.io/main/en/flight_modes_fw/mission.html and
+    https://ardupilot.org/plane/docs/rtl-mode.html, in which a plane circles until somebody lands it.
+    """
+    if plan.tasks.system != "wgs84" or flight.vehicle != "fixed-wing" or plan.length_m == 0:
+        return []
+    end = "may circle at home and not land" if flight.landing == "rtl" else "land without an approach"
+    return [
+        f"Fixed wings: the missions take off without a heading, and at their end UAVs {end}; add a takeoff and a landing that "
+        f"fit the site in the ground station."
     ]

@@ -149,7 +149,10 @@ def _of_gain(chosen: _Choice, plan: Plan) -> list[str]:
     if len(plan.unserved) < chosen.calm_unserved:
         more = chosen.calm_unserved - len(plan.unserved)
         gained.insert(0, f"{more} more {'task' if more == 1 else 'tasks'} that must be served")
-    return [f"Routes are changed further than tasks between stops that stay would do, for {' and '.join(gained)}."]
+    return [
+        f"Routes are changed further than tasks between stops that stay would do, for {' and '.join(gained)}; --min-gain asks "
+        f"for more."
+    ]
 
 
 def _never_planned(now: Situation, status: Status) -> list[str]:

@@ -19,12 +19,19 @@ MAX_TASKS = 100_000
 MAX_FLEET = 10_000
 #: Most characters of a name.
 MAX_NAME = 200
+#: What is said of tasks without names, which may have one where nothing looks for it.
+UNNAMED = (
+    "No id or name is given, so the tasks are called 1, 2, ... in the order of the file; if something else in it names them, "
+    "call that id."
+)
 # Far beyond what flies, and far within what float32 and sums of squares can hold.
 _MOST_METERS = 1e9
 _MOST_VALUE = 1e12
 _MOST_SECONDS = 1e9
 _MOST_SPEED = 1e4
 _ALTITUDES = (-1_000.0, 10_000.0)
+# Tasks this far from the depot are beyond what flies, and this near to it they are not.
+_FAR_DEGREES, _NEAR_DEGREES = 5.0, 2.0
 # Text that reverses what follows makes a name look like another one.
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 # Control characters, halves of characters that UTF-8 cannot hold, and separators of lines.
@@ -48,6 +55,7 @@ def check_tasks(tasks: TaskList, allow_duplicates: bool = False) -> None:
         raise ValueError(f"{source}: a unit of {tasks.meters_per_unit:g} m is none; give a length above 0.")
     check_names(tasks.ids, tasks.places, source)
     _check_points(tasks)
+    _check_depot_is_near(tasks)
     _check_range(tasks, "value", tasks.values, 0.0, _MOST_VALUE)
     _check_range(tasks, "service_s", tasks.service_s, 0.0, _MOST_SECONDS)
     given = ~np.isnan(tasks.altitudes)
@@ -107,6 +115,22 @@ def _check_points(tasks: TaskList) -> None:
         raise ValueError(f"{where}lat and lon are both 0, which is the sea off Africa; give the position.")
     axis = int(np.flatnonzero(bad[row])[0])
     raise ValueError(f"{where}{names[axis]} is {_text(points[row, axis])}; {_advice(points[row], axis, tasks.system, limits)}")
+
+
+def _check_depot_is_near(tasks: TaskList) -> None:
+    """
+    :raises ValueError: If all tasks are far from the depot, but near it once latitude and longitude change places
+    """
+    if tasks.system != "wgs84" or tasks.depot is None:
+        return
+    near, swapped = (np.abs(points - tasks.depot).max(axis=1) for points in (tasks.points, tasks.points[:, ::-1]))
+    if near.min() > _FAR_DEGREES and swapped.max() < _NEAR_DEGREES:
+        latitude, longitude = tasks.points[0]
+        raise ValueError(
+            f"{tasks.source}: {tasks.places[0]}: lat, lon are {_text(latitude)}, {_text(longitude)}, but the depot is at "
+            f"{_text(tasks.depot[0])}, {_text(tasks.depot[1])}: latitude and longitude look swapped in one of the two; "
+            "exchange them there."
+        )
 
 
 def _advice(point: np.ndarray, axis: int, system: str, limits: tuple[float, float]) -> str:

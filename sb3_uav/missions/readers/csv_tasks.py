@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from sb3_uav.missions.coordinates import System
-from sb3_uav.missions.readers.checks import MAX_TASKS, check_not_degrees, check_tasks
+from sb3_uav.missions.readers.checks import MAX_TASKS, UNNAMED, check_not_degrees, check_tasks
 from sb3_uav.missions.readers.columns import Cells, Column, Field, match_columns
 from sb3_uav.missions.readers.table import Table, read_table
 from sb3_uav.missions.tasks import TaskList
@@ -99,6 +99,7 @@ def read_csv_tasks(data: bytes, source: str, unit: str | None = None) -> TaskLis
         meters_per_unit=meters_per_unit,
         places=tuple(f"row {table.rows[row][0]}" for row in tasks),
         source=source,
+        notes=() if "id" in columns else (UNNAMED,),
     )
     if system == "plane" and not has_unit:
         check_not_degrees(read)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_uav.missions.coordinates import System
+from sb3_uav.missions.readers.checks import UNNAMED
 from sb3_uav.missions.readers.json_file import flag_of, id_of, number_of, parse_json, shown
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.writers.geojson_routes import PLANE_MEMBER
@@ -49,7 +50,7 @@ def read_geojson(data: bytes, source: str) -> TaskList:
     system, unit = _plane_of(content, source)
     rows: list[dict[str, Any]] = []
     depot: list[float] | None = None
-    has_heights = False
+    has_heights = has_names = False
     for number, feature in enumerate(_features_of(content, source), 1):
         where = f"{source}: feature {number}"
         position = _position_of(feature, where)
@@ -62,9 +63,11 @@ def read_geojson(data: bytes, source: str) -> TaskList:
             continue
         altitude = _first(properties, _ALTITUDE_NAMES)
         has_heights |= altitude is None and len(position) == 3 and position[2] != 0
+        name = _id_of(feature, properties, where)
+        has_names |= name is not None
         rows.append(
             {
-                "id": _id_of(feature, properties, number, where),
+                "id": str(number) if name is None else name,
                 "point": point,
                 "value": _number(properties, ("value", "priority"), 1.0, where),
                 "service_s": _number(properties, ("service_s",), 0.0, where),
@@ -88,7 +91,7 @@ def read_geojson(data: bytes, source: str) -> TaskList:
         meters_per_unit=unit,
         places=tuple(columns["place"]),
         source=source,
-        notes=(_HEIGHTS,) if has_heights else (),
+        notes=(*((_HEIGHTS,) if has_heights else ()), *(() if has_names else (UNNAMED,))),
     )
 
 
@@ -96,6 +99,8 @@ def _features_of(content: dict[str, Any], source: str) -> list[Any]:
     kind = content.get("type")
     if kind == "Feature":
         return [content]
+    if kind is None and "plannedHomePosition" in content:
+        raise ValueError(f"{source}: this is a mission of an old QGroundControl; open it there and save it as .plan.")
     if kind != "FeatureCollection":
         raise ValueError(f"{source}: type is {shown(kind)}; write a FeatureCollection of Points.")
     features = content.get("features")
@@ -111,8 +116,10 @@ def _check_crs(content: dict[str, Any], source: str) -> None:
     properties = crs.get("properties") if isinstance(crs, dict) else None
     name = properties.get("name") if isinstance(properties, dict) else None
     if not isinstance(name, str) or name not in _CRS84:
+        # By its definition latitudes come first there, but most programs write them second.
+        more = ", or delete crs if longitudes come first in the coordinates" if str(name).endswith(":4326") else ""
         raise ValueError(
-            f"{source}: crs is {shown(crs if name is None else name)}; export longitudes and latitudes on WGS84 (CRS84)."
+            f"{source}: crs is {shown(crs if name is None else name)}; export longitudes and latitudes on WGS84 (CRS84){more}."
         )
 
 
@@ -154,11 +161,11 @@ def _properties_of(feature: dict[str, Any], where: str) -> dict[str, Any]:
     return {**{name.lower(): value for name, value in properties.items()}, **properties}
 
 
-def _id_of(feature: dict[str, Any], properties: dict[str, Any], number: int, where: str) -> str:
+def _id_of(feature: dict[str, Any], properties: dict[str, Any], where: str) -> str | None:
     for holder, name in ((properties, "id"), (properties, "name"), (feature, "id")):
         if holder.get(name) not in (None, ""):
             return id_of(holder[name], name, where)
-    return str(number)
+    return None
 
 
 def _first(properties: dict[str, Any], names: tuple[str, ...]) -> Any:
@@ -166,5 +173,5 @@ def _first(properties: dict[str, Any], names: tuple[str, ...]) -> Any:
 
 
 def _number(properties: dict[str, Any], names: tuple[str, ...], default: float, where: str) -> float:
-    value = _first(properties, names)
-    return default if value is None else number_of(value, names[0], where, 0.0)
+    name = next((name for name in names if properties.get(name) is not None), None)
+    return default if name is None else number_of(properties[name], name, where, 0.0)

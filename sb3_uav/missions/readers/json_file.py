@@ -11,7 +11,18 @@ from typing import Any, NoReturn
 _LONGEST_ID = 200
 # Values that a file may have, each of which takes many times its bytes once read. A file of 100,000 tasks has half as many.
 _MOST_VALUES = 3_000_000
-_SHORT = reprlib.Repr()
+_OF_JSON = {"None": "null", "True": "true", "False": "false"}
+
+
+class _Repr(reprlib.Repr):
+    """The words of JSON for those of Python, within lists too."""
+
+    def repr1(self, x: Any, level: int) -> str:
+        text = super().repr1(x, level)
+        return _OF_JSON.get(text, text)
+
+
+_SHORT = _Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
 _SHORT.maxlist = _SHORT.maxdict = 4
 _SHORT.maxlevel = 2
@@ -61,7 +72,7 @@ def parse_json(data: bytes, source: str) -> dict[str, Any]:
 
 def shown(value: Any) -> str:
     """:return: A value as it may stand in an error, however large it is"""
-    return {"None": "null", "True": "true", "False": "false"}.get(text := _SHORT.repr(value), text)
+    return _SHORT.repr(value)
 
 
 def number_of(value: Any, what: str, where: str, least: float = -math.inf) -> float:

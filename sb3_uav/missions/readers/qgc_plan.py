@@ -15,6 +15,8 @@ from sb3_uav.missions.tasks import TaskList
 
 _VERSIONS = (1, 2)
 _N_PARAMS = 7
+# Old versions of QGroundControl wrote the position beside these, as "coordinate".
+_N_OLD_PARAMS = 4
 _LANDING_PATTERNS = ("fwLandingPattern", "vtolLandingPattern")
 _COMPLEX = {"survey": "a survey", "CorridorScan": "a corridor scan", "StructureScan": "a structure scan"}
 _LANDING_NOTE = "The file has a landing pattern, which the missions will not have; add an approach that fits the site."
@@ -106,7 +108,9 @@ def _is_landing_pattern(item: Any, where: str) -> bool:
 
 
 def _read_item(item: dict[str, Any], place: str, where: str) -> ReadItem:
-    params = item.get("params")
+    params, position = item.get("params"), item.get("coordinate")
+    if isinstance(params, list) and len(params) == _N_OLD_PARAMS and isinstance(position, list) and len(position) == 3:
+        params = [*params, *position]
     if not isinstance(params, list) or len(params) != _N_PARAMS:
         raise ValueError(f"{where}: params is {shown(params)}; write a list of {_N_PARAMS} numbers.")
     jump_id = item.get("doJumpId")

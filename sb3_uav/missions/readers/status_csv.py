@@ -160,8 +160,8 @@ def read_status_from_bytes(data: bytes, source: str) -> Status:
         kind, name = row.text("what").lower(), row.text("id")
         if kind not in KINDS:
             near = difflib.get_close_matches(kind, KINDS, 1, 0.5)
-            guess = f"did you mean {near[0]}? " if near else ""
-            row.fail(f"what is {row.text('what')[:40]!r}; {guess}It is one of {', '.join(KINDS)}.")
+            advice = f"did you mean {near[0]}? It is" if near else "write"
+            row.fail(f"what is {row.text('what')[:40]!r}; {advice} one of {', '.join(KINDS)}.")
         if not name:
             row.fail(f"id is empty; name the {'UAV' if kind in ('uav', 'lost') else 'task'}.")
         if len(name) > _MAX_NAME:

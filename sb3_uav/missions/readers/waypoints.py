@@ -20,7 +20,7 @@ all other commands: speed, camera, servo, ...        no tasks; a note says that 
 ==================================================== ==================================================================
 
 An item at (0, 0) or without a position stands for "here" and is no task. Altitudes above home are kept, but for 0, which
-stands for "any"; a note says so of altitudes above the sea or the terrain, which are not.
+stands for "any"; altitudes above the sea or the terrain are not, and a note says how those tasks are flown instead.
 """
 
 from __future__ import annotations
@@ -85,6 +85,7 @@ class _Found:
     items: list[ReadItem] = field(default_factory=list)
     service: list[float] = field(default_factory=list)
     altitudes: list[float] = field(default_factory=list)
+    lost_altitudes: list[float] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
 
 
@@ -161,7 +162,7 @@ def _add_task(found: _Found, item: ReadItem, where: str) -> bool:
         raise ValueError(f"{where}: the hold is {hold:g} s; write 0 or more.")
     is_above_home = item.frame in _ABOVE_HOME
     if not is_above_home and altitude:
-        found.left_out["an altitude that is not relative to home"] += 1
+        found.lost_altitudes.append(altitude)
     found.items.append(item)
     found.service.append(hold or 0.0)
     found.altitudes.append(altitude if is_above_home and altitude else math.nan)
@@ -176,7 +177,15 @@ def _seconds(item: ReadItem, where: str) -> float:
 
 
 def _notes(found: _Found) -> tuple[str, ...]:
-    if not found.left_out:
-        return ()
-    counts = ", ".join(f"{what} ({count})" for what, count in sorted(found.left_out.items())[:_MOST_IN_NOTE])
-    return (f"The file has what the missions will not have: {counts}.",)
+    notes = []
+    if found.lost_altitudes:
+        low, high = min(found.lost_altitudes), max(found.lost_altitudes)
+        span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        notes.append(
+            f"The file has altitudes above the sea or the terrain ({len(found.lost_altitudes)}, {span} m), which the missions "
+            "do not have: these tasks are flown at the altitude of the UAV above the depot; check it against the terrain."
+        )
+    if found.left_out:
+        counts = ", ".join(f"{what} ({count})" for what, count in sorted(found.left_out.items())[:_MOST_IN_NOTE])
+        notes.append(f"The file has what the missions will not have: {counts}.")
+    return tuple(notes)

@@ -20,6 +20,10 @@ from sb3_uav.missions.writers.mission_items import altitudes_of, check_is_geogra
 _NAMESPACE = "http://www.opengis.net/kml/2.2"
 # Colors of lines as KML has them: opacity, blue, green, red.
 _COLORS = ("ff3c14dc", "ffc77a1f", "ff4b8f22", "ff00a5ff", "ff9e2d8b", "ffb0a000", "ff1f4fa8", "ff7f5f00")
+_HEIGHTS = (
+    "Altitudes are drawn above the ground, but flown above the depot: where the ground is higher than the depot, the UAVs are "
+    "that much nearer to it than drawn."
+)
 # What XML 1.0 has no way to write (https://www.w3.org/TR/xml/#charsets), with the surrogates that UTF-8 cannot encode.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -40,6 +44,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
     root = ElementTree.Element("kml", xmlns=_NAMESPACE)
     document = ElementTree.SubElement(root, "Document")
     _text(document, "name", f"Routes for {Path(tasks.source).name}")
+    _text(document, "description", _HEIGHTS)
     for number, color in enumerate(_COLORS):
         style = ElementTree.SubElement(document, "Style", id=f"uav-{number}")
         line = ElementTree.SubElement(style, "LineStyle")
@@ -62,6 +67,7 @@ def write_kml(plan: Plan, path: Path, flight: FlightOptions) -> None:
 def _route_folder(document: ElementTree.Element, plan: Plan, uav: int, route: Route, flight: FlightOptions) -> None:
     tasks, own = plan.tasks, flight.altitude_of(plan.fleet.level_of(uav))
     altitudes = altitudes_of(plan, uav, flight)
+    last = altitudes[-1] if altitudes else own
     folder = _folder(document, route.uav.id)
     placemark = ElementTree.SubElement(folder, "Placemark")
     _text(placemark, "name", f"Route of {route.uav.id}")
@@ -74,7 +80,7 @@ def _route_folder(document: ElementTree.Element, plan: Plan, uav: int, route: Ro
     parent = ElementTree.SubElement(placemark, "MultiGeometry")
     vertices = [
         (longitude, latitude, altitude)
-        for (latitude, longitude), altitude in zip(route.points.tolist(), [own, *altitudes, own], strict=True)
+        for (latitude, longitude), altitude in zip(route.points.tolist(), [own, *altitudes, last], strict=True)
     ]
     for part in split_at_antimeridian(vertices):
         line = ElementTree.SubElement(parent, "LineString")

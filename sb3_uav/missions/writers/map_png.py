@@ -28,9 +28,17 @@ _MAX_NAMED = 20
 # Dashes as plotly names them.
 _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 _COLUMNS = 2
-# Points between two numbers, and from a stop to its number.
+# Points between two numbers, and between a number and the stop of another.
 _LABEL_WIDTH, _LABEL_HEIGHT = 11.0, 7.5
-_LABEL_OFFSET = 4.0
+_STOP_WIDTH, _STOP_HEIGHT = 7.0, 6.0
+# Where the number of a stop may stand: points from it, how the text is aligned there, and points to the middle of it.
+_Place = tuple[tuple[float, float], str, str, tuple[float, float]]
+_LABEL_PLACES: tuple[_Place, ...] = (
+    ((4.0, 2.0), "left", "baseline", (7.0, 4.0)),
+    ((-4.0, 2.0), "right", "baseline", (-7.0, 4.0)),
+    ((0.0, 4.0), "center", "bottom", (0.0, 7.0)),
+    ((0.0, -4.0), "center", "top", (0.0, -7.0)),
+)
 
 
 def write_map_png(plan: Plan, path: Path) -> None:
@@ -73,8 +81,10 @@ def map_figure(plan: Plan) -> Any:
     taken: list[np.ndarray] = [] if depot is None else [depot * points_per_meter]
     for uav, (route, path) in enumerate(zip(plan.routes, paths, strict=True)):
         _draw_route(axes, plan, uav, route, path, size)
-    for route, path in zip(plan.routes, paths, strict=True):
-        _number_stops(axes, path[1:-1] if route.stops else path[:0], points_per_meter, taken)
+    stops = [path[1:-1] for path in paths]
+    everywhere = np.unique(np.vstack(stops), axis=0) * points_per_meter
+    for own in stops:
+        _number_stops(axes, own, points_per_meter, taken, everywhere)
     if plan.tasks.must.any():
         axes.scatter([], [], marker="*", s=70, color="0.4", linewidths=0, label="stop that must be served")
     _draw_skipped(axes, plan, tasks, size, (low, high))
@@ -147,7 +157,9 @@ def _draw_route(axes: Any, plan: Plan, uav: int, route: Route, path: np.ndarray,
             axes.scatter(*point, marker=marker, s=50, color=color, edgecolors="black", linewidths=0.8, zorder=6)
 
 
-def _number_stops(axes: Any, stops: np.ndarray, points_per_meter: float, taken: list[np.ndarray]) -> None:
+def _number_stops(
+    axes: Any, stops: np.ndarray, points_per_meter: float, taken: list[np.ndarray], everywhere: np.ndarray
+) -> None:
     """
     Write the numbers of the stops next to them, as many as fit: the first and the last come first, then round ones.
 
@@ -155,6 +167,7 @@ def _number_stops(axes: Any, stops: np.ndarray, points_per_meter: float, taken: 
     :param stops: ``(n, 2)`` in meters
     :param points_per_meter: Scale of the map
     :param taken: Where numbers stand already, in points; grows
+    :param everywhere: ``(m, 2)``, the stops of all routes, in points
     """
     from matplotlib.patheffects import withStroke
 
@@ -166,19 +179,44 @@ def _number_stops(axes: Any, stops: np.ndarray, points_per_meter: float, taken: 
 
     for stop in sorted(range(len(stops)), key=rank):
         place = stops[stop] * points_per_meter
-        if taken and (np.abs(np.array(taken) - place) < (_LABEL_WIDTH, _LABEL_HEIGHT)).all(axis=1).any():
+        free = _free_place(place, np.array(taken).reshape(-1, 2), everywhere[(everywhere != place).any(axis=1)])
+        if free is None:
             continue
-        taken.append(place)
+        offset, across, along, middle = free
+        taken.append(place + middle)
         axes.annotate(
             str(stop + 1),
             stops[stop],
-            (_LABEL_OFFSET, _LABEL_OFFSET / 2),
+            offset,
+            ha=across,
+            va=along,
             textcoords="offset points",
             fontsize=6.5,
             zorder=7,
             path_effects=halo,
             annotation_clip=True,
         )
+
+
+def _free_place(place: np.ndarray, taken: np.ndarray, others: np.ndarray) -> _Place | None:
+    """
+    :param place: ``(2,)``, a stop, in points
+    :param taken: ``(n, 2)``, middles of numbers
+    :param others: ``(m, 2)``, the other stops
+    :return: The first of :data:`_LABEL_PLACES` that is free. To the right of its stop, a number is read as that of the stop,
+        whatever is next to it; elsewhere no other stop may be near
+    """
+    for found in _LABEL_PLACES:
+        label = place + found[3]
+        is_plain = found is _LABEL_PLACES[0] or not _is_near(label, others, _STOP_WIDTH, _STOP_HEIGHT)
+        if is_plain and not _is_near(label, taken, _LABEL_WIDTH, _LABEL_HEIGHT):
+            return found
+    return None
+
+
+def _is_near(place: np.ndarray, others: np.ndarray, width: float, height: float) -> bool:
+    """:return: Whether one of the others is in a box around the place"""
+    return bool((np.abs(others - place) < (width, height)).all(axis=1).any())
 
 
 def _draw_scale(axes: Any, low: np.ndarray, high: np.ndarray, up: str) -> None:
