@@ -78,6 +78,7 @@ def lit(visit: Visit) -> str | None:
     return visit.page.get_attribute("#map", "data-lit")
 
 
+@pytest.mark.slow
 def test_all_tours_are_there_and_the_legend_hides_them(opened: Opener):
     with opened(plan_of_all_kinds()) as visit:
         page = visit.page
@@ -102,6 +103,7 @@ def test_all_tours_are_there_and_the_legend_hides_them(opened: Opener):
         assert lit(visit) == "0"
 
 
+@pytest.mark.slow
 def test_a_click_lights_a_tour_up_and_another_resets(opened: Opener):
     with opened(plan_of_all_kinds()) as visit:
         page = visit.page
@@ -125,18 +127,20 @@ def test_a_click_lights_a_tour_up_and_another_resets(opened: Opener):
         click(visit, *place(visit, "stops", 0, 0))
         assert lit(visit) == "0"
         # Empty ground resets, and whoever moves the map has not clicked.
-        x, y = place(visit, "depot", None, 0)
-        page.mouse.move(x - 300, y)
+        box = page.locator(".nsewdrag").bounding_box()
+        assert box is not None
+        x, y = box["x"] + 40, box["y"] + 200
+        page.mouse.move(x, y)
         page.mouse.down()
-        page.mouse.move(x - 200, y - 30, steps=3)
+        page.mouse.move(x + 100, y - 30, steps=3)
         page.mouse.up()
         assert lit(visit) == "0"
-        click(visit, x - 300, y)
+        click(visit, x, y)
         assert lit(visit) == ""
         # One task is 22 km in the north.
         assert page.evaluate("() => map._fullLayout.yaxis.range[1]") < 3_000
         page.wait_for_timeout(PAUSE_MS)
-        page.mouse.dblclick(x - 300, y)
+        page.mouse.dblclick(x, y)
         page.wait_for_function("() => map._fullLayout.yaxis.range[1] > 20000")
         assert lit(visit) == ""
 
@@ -182,6 +186,7 @@ def test_the_picture_can_be_saved_and_the_policy_stops_scripts_and_requests(open
         assert sum("Content Security Policy" in error for error in visit.errors) >= 3
 
 
+@pytest.mark.slow
 def test_a_small_window_in_which_stops_get_their_numbers_when_zoomed(opened: Opener):
     with opened(spread_plan(400, 12), width=390, height=800) as visit:
         page = visit.page
