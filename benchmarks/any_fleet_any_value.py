@@ -6,6 +6,14 @@ CPU times of one core; run it on a quiet machine.
 
     python benchmarks/any_fleet_any_value.py --pair universal --out floors.csv
     python benchmarks/any_fleet_any_value.py --allocator allocator_90.zip --router router_90.zip --parts values dear whole
+    python benchmarks/any_fleet_any_value.py --pair world --parts ablation
+
+The ablation asks what each field of the problem is worth to the networks: they see the same instances with one field
+replaced by its default (values all 1; service costs 0; UAVs start, or end, at the depot; every UAV flies as far as the mean
+of them, which concerns the allocator only, as a router looks at one UAV). Nothing else changes: which actions are legal,
+how long tours are, what the best of several schedules is and what the checker measures are always those of the true
+instance. So every schedule is feasible, and the ratio is what blindness costs networks that were trained to see; networks
+that are trained without a field may do better than these. Only instances in which the field differs from its default count.
 """
 
 from __future__ import annotations
@@ -13,10 +21,11 @@ from __future__ import annotations
 import argparse
 import csv
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -24,12 +33,74 @@ import torch as th
 from sb3_uav.common.random_streams import keyed_generator
 from sb3_uav.common.statistics import Interval
 from sb3_uav.envs import ClusteredGenerator, Instances, UniformGenerator, WorldGenerator, check_schedule
-from sb3_uav.solvers import Solver, make_solver
+from sb3_uav.policies import AllocatorPolicy, RouterPolicy
+from sb3_uav.policies.loading import StoredPolicy, read_policy
+from sb3_uav.solvers import DLDRL, Solver, make_solver
 
 # Fleets, maximum distances and sizes of the clustered and uniform sets: V 2 to 10, D 1 to 3, N 40 to 400.
 _SETS = ((2, 1.0, 40), (3, 1.5, 80), (4, 2.0, 100), (6, 2.0, 200), (8, 2.5, 300), (10, 3.0, 400))
 # A task in reach of a UAV that flies for nothing else.
 _DEAR_REACH = 0.97
+# Fleets and sizes of the ablation.
+_ABLATED = ((3, 50), (4, 100))
+
+Hide = Callable[[Instances], Instances]
+
+
+def _without_ranges(instances: Instances) -> Instances:
+    return replace(instances, max_distance=instances.uav_distance.mean(1))
+
+
+def _without_values(instances: Instances) -> Instances:
+    return replace(instances, values=instances.task_mask.to(instances.values.dtype), must_serve=None)
+
+
+# What networks see in place of an instance.
+HIDDEN: dict[str, Hide] = {
+    "values": _without_values,
+    "service": lambda instances: replace(instances, service=None),
+    "start": lambda instances: replace(instances, start=None),
+    "end": lambda instances: replace(instances, end=None),
+    "ranges": _without_ranges,
+    "all of these": lambda instances: _without_values(_without_ranges(replace(instances, service=None, start=None, end=None))),
+}
+
+
+class BlindAllocator(AllocatorPolicy):
+    """An allocator that sees instances with a field hidden. Which UAVs may take a task is no matter of what it sees."""
+
+    hide: Hide
+
+    def task_order(self, instances: Instances, variant: int = 0) -> th.Tensor:
+        return super().task_order(self.hide(instances), variant)
+
+    def encode(self, instances: Instances) -> Any:
+        return super().encode(self.hide(instances))
+
+    def encode_nodes(self, instances: Instances) -> th.Tensor:
+        return super().encode_nodes(self.hide(instances))
+
+    def arranged_cache(self, nodes: th.Tensor, order: th.Tensor, arranged: Instances) -> Any:
+        return super().arranged_cache(nodes, order, self.hide(arranged))
+
+
+class BlindRouter(RouterPolicy):
+    """A router that sees instances with a field hidden. Where it may fly is no matter of what it sees."""
+
+    hide: Hide
+
+    def encode(self, instances: Instances) -> Any:
+        return super().encode(self.hide(instances))
+
+
+def tells(instances: Instances, hide: Hide) -> th.Tensor:
+    """:return: ``(batch,)`` bool, in which instances a field that is hidden differs from what is seen in its place"""
+    hidden = hide(instances)
+    pairs = [
+        (getattr(instances, name), getattr(hidden, name))
+        for name in ("prizes", "service_cost", "uav_start", "uav_end", "uav_distance")
+    ]
+    return th.stack([(true != seen).flatten(1).any(1) for true, seen in pairs]).any(0)
 
 
 class Row(NamedTuple):
@@ -67,6 +138,11 @@ class Measuring:
     def networks(self, options: str) -> Solver:
         """:return: The pair with these options"""
         return make_solver(f"dl-drl:{','.join(part for part in (options, self.pair) if part)}")
+
+    @cached_property
+    def stored(self) -> list[StoredPolicy]:
+        """The allocator and the router as their zips hold them."""
+        return [read_policy(file) for file in self.networks("").files.values()]
 
     def objectives(self, solver: Solver, instances: Instances) -> tuple[np.ndarray, float]:
         """:return: ``(n,)`` objectives that the checker accepts, and CPU seconds per instance"""
@@ -128,25 +204,52 @@ class Measuring:
             for options in ("decode=greedy", "decode=augment", "decode=augment,repair=1,polish=1,time_limit=1"):
                 yield self.compare("whole", f"world, V = {n_uavs}, N = {n_tasks}", instances, options, "pyvrp:time_limit=1")
 
+    def blind(self, decode: str, hide: Hide) -> DLDRL:
+        """:return: The pair with this decoding, and with something hidden from both networks"""
+        networks: list[Any] = []
+        for network, cls in zip(self.stored, (BlindAllocator, BlindRouter), strict=True):
+            networks.append(cls.from_parameters(network.parameters, network.policy_kwargs, "cpu"))
+            networks[-1].hide = hide
+        return DLDRL(networks[0], networks[1], decode)
+
+    def ablation(self) -> Iterator[Row]:
+        """One field after the other hidden from the networks."""
+        for n_uavs, n_tasks in _ABLATED:
+            generator = WorldGenerator(n_tasks, n_uavs, whole_share=1.0, paper_share=0.0)
+            instances = generator(2 * self.n_instances, keyed_generator(self.seed, 400 + n_tasks))
+            for decode in ("greedy", "augment"):
+                seen, _ = self.objectives(self.networks(f"decode={decode}"), instances)
+                for field, hide in HIDDEN.items():
+                    rows = tells(instances, hide)
+                    if rows.sum() < 2:
+                        continue
+                    blind, seconds = self.objectives(self.blind(decode, hide), instances[rows])
+                    ratio = Interval.of_ratio(blind, seen[rows.numpy()])
+                    name = f"world, V = {n_uavs}, N = {n_tasks}"
+                    yield Row("ablation", name, f"decode={decode}, {field} hidden", "nothing hidden", ratio, seconds)
+
 
 _PARTS: dict[str, Callable[[Measuring], Iterator[Row]]] = {
     "maps": Measuring.maps,
     "values": Measuring.values,
     "dear": Measuring.dear,
     "whole": Measuring.whole,
+    "ablation": Measuring.ablation,
 }
+# Of a pair that is measured for the first time.
+_DEFAULT_PARTS = [part for part in _PARTS if part != "ablation"]
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pair", default="", help="name of a trained pair; the default pair when not given")
     parser.add_argument("--allocator", type=Path, help="zip of an allocator, in place of --pair")
     parser.add_argument("--router", type=Path, help="zip of its router")
-    parser.add_argument("--parts", nargs="+", choices=sorted(_PARTS), default=list(_PARTS), help="default: all")
+    parser.add_argument("--parts", nargs="+", choices=sorted(_PARTS), default=_DEFAULT_PARTS, help="default: all but ablation")
     parser.add_argument("--n-instances", type=int, default=8, help="instances of each kind (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=20261207, help="seed of the instances (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="CSV file to write")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     th.set_num_threads(1)
     options = {"allocator": args.allocator or args.pair or None, "router": args.router}
     pair = ",".join(f"{name}={value}" for name, value in options.items() if value is not None)

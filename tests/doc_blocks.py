@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[1]
 # Pages whose blocks have a test of their own.
 TESTED_ELSEWHERE = {
     "docs/zoo.md": "test_zoo_docs.py",
+    "docs/serve.md": "test_web_api.py",
     "docs/foreign_environments.md": "test_masked_attention_in_sb3.py",
 }
 PAGES = sorted(
@@ -74,6 +75,8 @@ _SMALL = "--conf-file small/{}.yml -n 1280 --num-threads 1"
 RULES = [
     # A server, which never ends.
     Rule("*", r"tensorboard --logdir (\S+)", r"tensorboard --logdir \1 --inspect"),
+    Rule("README.md", r"sb3-uav serve", "sb3-uav serve --help"),
+    Rule("README.md", r"(sb3-uav solve .*) -o", r"\1 --time-limit 1 -o"),
     # Smaller data, networks and budgets.
     Rule("README.md", r"rand\(16, ", "rand(2, "),
     Rule("README.md", r"n_envs=64", "n_envs=4"),
@@ -103,6 +106,8 @@ RULES = [
     # The files beside the tests have other names.
     Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
     Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),
+    Rule("docs/missions.md", r"(sb3-uav solve .*) -o", r"\1 --time-limit 1 -o"),
+    Rule("docs/missions.md", r"time_limit=10", "time_limit=1"),
     Rule("docs/results/*", r"U4-N80\.npz U6-N80\.npz \.\.\. \S+", "U4-N80.npz"),
     Rule("docs/results/*", r"U4-N500\.npz U6-N200\.npz", "U4-N80.npz"),
     Rule("docs/results/*", r"(time_limit|polish)=10?\b", r"\1=0.2"),

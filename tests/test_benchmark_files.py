@@ -259,6 +259,10 @@ def test_npz_files_have_a_name_for_each_row(tmp_path: Path, instances: Instances
     last = folder.instances["mine.4"]
     assert same(last.instances, instances[4].trim(6)) and last.nodes == (0, 1, 2, 3, 4, 5)
     assert list(read_folder(tmp_path, ["mine.3"]).instances) == ["mine.3"]
+    # As other systems write it.
+    (tmp_path / "mine.npz").rename(tmp_path / "mine.NPZ")
+    assert list(read_folder(tmp_path).instances) == list(folder.instances)
+    assert list(read_folder(tmp_path, ["mine.3"]).instances) == ["mine.3"]
 
 
 def test_folders_in_the_folder_are_groups(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from sb3_uav.evaluation.benchmarks.gaps import GapRow, failures, find_gaps, gap_
 from sb3_uav.evaluation.benchmarks.instance import BenchmarkInstance
 from sb3_uav.evaluation.benchmarks.report import markdown_table, report
 from sb3_uav.evaluation.benchmarks.rounding import check_rounded, fill, fit_to_rule, rounded_distance
-from sb3_uav.evaluation.benchmarks.summary_file import repairs
+from sb3_uav.evaluation.benchmarks.summary_file import omissions, repairs
 
 
 def test_halves_are_rounded_up() -> None:
@@ -213,6 +213,21 @@ def test_depot_and_room_count(tmp_path: Path) -> None:
     assert (row.objective, row.euclidean_objective, row.gap, row.n_added, row.length) == (10, 7, 0, 1, 5)
     assert row.reached and not row.better and sorted(route["routes"][0]) == [2, 3]
     assert repairs([row]) == ["told: by the rounding rule 1 task could be put into 1 of its tours."]
+
+
+def test_no_value_makes_up_for_what_must_be_served(tmp_path: Path) -> None:
+    plain = on_a_line([0.5, 0.6, -0.5], [9.0, 9.0, 1.0], 2.5)
+    line = replace(plain, must_serve=plain.values < 2)
+    members = [benchmark(line, "a.left"), benchmark(line, "a.done"), benchmark(plain, "a.plain")]
+    evaluate([Told([[0, 1], [0, 2], [0, 1]])], {member.name: member.instances for member in members}, tmp_path)
+    rows, lines = find_gaps(tmp_path, members, dict.fromkeys(("a.left", "a.done", "a.plain"), 10.0))
+    assert [row.unserved for row in rows] == [1, 0, 0]
+    assert [(row.reached, row.better) for row in rows] == [(False, False), (True, False), (True, True)]
+    assert [row.gap for row in rows] == [-80, 0, -80]
+    # By its number in the file.
+    assert lines[0]["unserved"] == [4] and "unserved" not in lines[1]
+    (said,) = omissions(rows)
+    assert said.startswith("told: 1 of 3 results leave out tasks that must be served") and "gaps.csv" in said
 
 
 def test_several_limits_count_once_among_failures() -> None:

@@ -226,6 +226,18 @@ def test_table_shows_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[2:] == ["Solver Obj. error % instance Feasible", lines[3], "alone - - - - 0/1"]
 
 
+def test_tasks_left_out_stand_beside_the_values(capsys: pytest.CaptureFixture[str]) -> None:
+    """Figures are of values alone; what must be served is counted in a column of its own."""
+    found = {"a": make_rows("a", [9.0, 9.0]), "b": make_rows("b", [5.0, 7.0])}
+    found["a"] = [ResultRow(**{**vars(row), "unserved": i + 1}) for i, row in enumerate(found["a"])]
+    a, b = summarize("set", found, "b")
+    assert (a.n_unserved, b.n_unserved, a.difference) == (3, 0, 3.0)
+    assert b.unserved == () and a.unserved[0].startswith("a, 2 of 2 instances of set: leaves out tasks that must be served")
+    print_table([a, b])
+    lines = table_lines(capsys)
+    assert lines[2].endswith("instance served") and lines[4].endswith(" 1.0000 3") and lines[5].endswith(" 1.0000 0")
+
+
 def test_table_fits_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """With 80 columns, names are folded and figures are whole; where the output is a file, no name is folded."""
     name = "dl-drl:allocator=a/rather/long/path/allocator.zip,router=a/rather/long/path/router.zip"

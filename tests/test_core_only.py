@@ -89,6 +89,8 @@ CASES: list[tuple[list[str], list[str], str]] = [
     (["matplotlib"], ["plot-from-file"], "zoo-plots"),
     (["pytablewriter"], ["benchmark"], "zoo"),
     (["wandb"], ["train", *ROUTING, "--track"], "track"),
+    ([*EVERYTHING, "plotly"], ["solve", "tasks.csv", "-o", "out"], "missions"),
+    (["plotly"], ["solve", "tasks.csv", "-o", "out"], "missions"),
 ]
 
 

@@ -12,6 +12,7 @@ from solver_helpers import MANY, make_pair, make_policy, objectives, routes
 from sb3_uav.envs import Instances, UniformGenerator
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy, memory
 from sb3_uav.solvers import DLDRL, decoding
+from sb3_uav.solvers.seen_instances import View
 from sb3_uav.solvers.shortlists import Block, Shortlists
 
 
@@ -166,7 +167,7 @@ def test_wrong_fleet(instances: Instances) -> None:
 
 
 def test_augmentation_is_never_worse_than_greedy(instances: Instances) -> None:
-    """The first view is the instance itself, and the first tour of each subset the greedy one."""
+    """One view is the instance itself, and the first tour of each subset the greedy one."""
     greedy = objectives(make_pair(), instances)
     augmented = objectives(make_pair(decode="augment", samples=128), instances)
     assert (augmented >= greedy).all() and augmented.sum() > greedy.sum()
@@ -191,10 +192,11 @@ def test_augmentation_plans_no_more_tours_than_asked_for(
     assert sum(planned) == samples * 9 * 3
 
 
-def test_views_of_augmentation() -> None:
+@pytest.mark.parametrize("pose", range(8))
+def test_views_of_augmentation(pose: int) -> None:
     """First all symmetries in both directions from the widest gap, then the same from the next gap."""
-    views = [decoding._view_of(number) for number in range(3 * decoding._N_VIEWS)]
-    assert len(set(views)) == len(views)
+    views = [decoding._view_of(number, pose) for number in range(3 * decoding._N_VIEWS)]
+    assert len(set(views)) == len(views) and views[0] == View(pose, 0)
     for turn in range(3):
         of_turn = views[turn * decoding._N_VIEWS : (turn + 1) * decoding._N_VIEWS]
         assert {view.symmetry for view in of_turn} == set(range(8)) and {view.sweep // 2 for view in of_turn} == {turn}

@@ -27,6 +27,7 @@ from forked import run_forked
 from PIL import Image
 
 from sb3_uav.envs import Instances, check_schedule
+from sb3_uav.missions import load_plan
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
@@ -41,6 +42,8 @@ NEEDED = {
     "kmeans-vnd": "numba",
     "onnx": "onnxscript",
     "sb3-uav": "rl_zoo3",
+    "sb3-uav solve": "plotly",
+    "read_tasks": "pyproj",
 }
 ALGORITHMS = ("reinforce", "ppo", "ppo_mask", "a2c")
 
@@ -113,7 +116,17 @@ def check_benchmarks(folder: Path, variables: dict[str, Any]) -> None:
     assert [row.instance for row in variables["rows"]] == ["a1.2.a", "a1.2.b"]
 
 
+def check_missions(folder: Path, variables: dict[str, Any]) -> None:
+    for name, n_tasks, least in (("orchard", 120, 108), ("city", 400, 180), ("lattice", 100, 88)):
+        plan = load_plan(folder / name / "mission.json")
+        assert len(plan.tasks) == n_tasks and plan.n_served >= least and not plan.unserved
+    again = load_plan(folder / "lattice-replanned" / "mission.json")
+    assert [uav.id for uav in again.fleet] == ["uav-1", "uav-2", "uav-4"] and "gate" in again.tasks.ids
+    assert {path.name for path in variables["files"]} == {path.name for path in (folder / "orchard").iterdir()}
+
+
 CHECKS: dict[str, Check] = {
+    "docs/missions.md": check_missions,
     "docs/benchmarks.md": check_benchmarks,
     "docs/fine_tuning.md": check_fine_tuning,
     "README.md": check_readme,

@@ -11,7 +11,9 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "sb3_uav").rglob("*.md")])
+DOCUMENTS = sorted(
+    [*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "examples").rglob("*.md"), *(ROOT / "sb3_uav").rglob("*.md")]
+)
 PNGS, PDFS = sorted(DOCS.rglob("*.png")), sorted(DOCS.rglob("*.pdf"))
 # [text](target), ![text](target "title") and [name]: target
 LINK = re.compile(r"\]\(\s*<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\s*\)|^\[[^\]]+\]:\s*(\S+)", re.MULTILINE)

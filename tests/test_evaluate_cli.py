@@ -225,7 +225,9 @@ def test_tasks_that_must_be_served_are_named_where_they_are_not(tmp_path: Path, 
     assert "one: 1 of 3 tasks are out of reach of every UAV" in said
     assert "one: instance 0: tasks that must be served are among them: 1." in said
     assert "local-search:time_limit=0.05, 1 of 1 instances of one: leaves out tasks that must be served" in said
-    assert read_results(out)[0]["message"] == "does not serve tasks that must be served: 1"
+    (row,), (totals,) = read_results(out), read_summary(out)
+    assert row["message"] == "does not serve tasks that must be served: 1"
+    assert (row["unserved"], totals["n_unserved"]) == ("1", "1")
     (line,) = (out / "schedules.jsonl").read_text().splitlines()
     record = json.loads(line)
     assert record["unserved"] == [1] and sorted(task for route in record["routes"] for task in route) == [0, 2]

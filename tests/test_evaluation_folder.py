@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from sb3_uav.envs import Instances
 from sb3_uav.evaluation import folder as evaluation_folder
 from sb3_uav.evaluation import provenance
 from sb3_uav.evaluation.locking import locked_folder
-from sb3_uav.evaluation.results import RESULT_COLUMNS
+from sb3_uav.evaluation.results import RESULT_COLUMNS, read_results
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.solvers import Solver, make_solver
 
@@ -78,6 +80,34 @@ def test_resuming_after_a_crash_at_any_byte(data: st.DataObject, instances: Inst
     evaluate([solver, Stub()], {'a "b",': instances}, cut, resume=True)
     assert len(solver.solved) == 5 - min(n_whole, 5)
     assert contents(cut) == contents(whole)
+
+
+class Idle(Stub):
+    """Serves what it is told, and does not mind tasks that must be served."""
+
+    def check(self, instances: Instances) -> None: ...
+
+
+def test_folders_without_the_number_of_tasks_left_out_are_resumed(instances: Instances, tmp_path: Path) -> None:
+    """As versions wrote them that named such tasks in the message only."""
+    must_serve = instances.task_mask.clone()
+    must_serve[:, 2:] = False
+    sets = {"a": replace(instances[:3], must_serve=must_serve[:3]), "b": instances[3:]}
+    whole, earlier = tmp_path / "whole", tmp_path / "earlier"
+    solvers = [Idle(), named("half", Idle([[1]])), Nearest(places(instances)[:3])]
+    summary = evaluate(solvers, sets, whole)
+    assert [row.n_unserved for row in summary] == [6, 3, 0, 0, 0, 0]
+    shutil.copytree(whole, earlier)
+    rows = read_rows(earlier)
+    # The last one fails on the first set.
+    assert [row["unserved"] for row in rows] == ["2", "2", "2", "1", "1", "1", "", "", ""] + ["0"] * 6
+    with (earlier / "results.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, RESULT_COLUMNS[:-1], extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    assert read_results(earlier / "results.csv") == read_results(whole / "results.csv")
+    again = evaluate(solvers, sets, earlier, resume=True)
+    assert contents(earlier) == contents(whole) and figures(again) == figures(summary)
 
 
 def test_a_new_start_forgets(instances: Instances, tmp_path: Path) -> None:

@@ -113,6 +113,8 @@ def test_size_grid_callback_says_what_replaces_it():
         (dict(sizes=[[2, 9]]), r"sizes: \[2, 9\] must be three whole numbers"),
         (dict(sizes=[[2, 9, 0]]), r"sizes: \[2, 9, 0\] must be three whole numbers of at least 1"),
         (dict(sizes=[[2, 9, 4], [2, 9, 8]]), "sizes: 2 UAVs and 9 tasks stand twice"),
+        (dict(sizes=[[2, 9, 4], [2, 9, 4, "uniform"]]), r"2 UAVs and 9 tasks stand twice \(uniform\); name every set once"),
+        (dict(sizes=[[2, 9, 4, "clustered"], [2, 9, 8, "clustered"]]), r"tasks stand twice \(clustered\)"),
         (dict(sizes=SIZES, instances="set.npz"), "instances and sizes are both given"),
         (dict(instances=[]), "instances is empty"),
         (dict(eval_updates=0), "eval_updates is 0; it must be a whole number of at least 1"),

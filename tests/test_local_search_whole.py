@@ -245,6 +245,19 @@ def test_a_uav_that_cannot_reach_its_end_takes_no_tasks() -> None:
         assert sorted(search(instance, Schedule([])).routes[1]) == [0, 1]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_annealing_is_blind_to_the_end_of_a_uav_that_cannot_fly(seed: int) -> None:
+    """Its way is no part of the length that tours are saved."""
+    found = []
+    for far in (3.0, 30.0):
+        end = np.full((3, 2), 0.5)
+        end[2] += far
+        instance = whole(60, 3, seed, max_distance=np.array([1.5, 1.8, 1.0]), start=np.full((3, 2), 0.5), end=end)
+        search = LocalSearch(instance)
+        found.append(search.improve(Schedule([]), seed=seed, n_trials=1000).routes)
+    assert found[0] == found[1] and found[0][2] == () and min(map(len, found[0][:2])) > 0
+
+
 def test_a_uav_that_flies_a_tiny_part_of_what_another_flies() -> None:
     """Rounding of the far one's coordinates must not make tours of the near one too long for the checker."""
     rng = np.random.default_rng(0)

@@ -95,7 +95,7 @@ def test_tasks_that_are_left_out_say_why():
     assert list(found) == ["out of reach: 1 task", "worth nothing: 1 task", "did not fit: 1 task"]
     assert len({trace.marker.symbol[0] for trace in found.values()}) == 3
     far = found["out of reach: 1 task"]
-    assert far.hovertext[0].startswith("<b>e</b>, must be served<br>out of reach: 39,")
+    assert far.hovertext[0].startswith("<b>e</b>, must be served<br>out of reach: 39.1 km")
     assert "m of range missing<br>lat 47.2000000, lon 8.0000000<br>value 5" in far.hovertext[0]
     assert far.marker.color != found["did not fit: 1 task"].marker.color
     assert next(trace.name for trace in traces(figure, "key")) == "must be served: 2 tasks, 1 left out"
@@ -184,7 +184,7 @@ def test_tables_remarks_and_the_call_for_review_are_on_the_page():
     assert [button["data-uav"] for button in page.named("button")] == ["0", "1", "2"]
     # Of the range 10 % are kept; the bar says so.
     assert "left:90.00%" in {tag["style"] for tag in page.named("b") if "style" in tag}
-    assert "out of reach: 39," in page.text and "must be served" in page.text
+    assert "out of reach: 39.1 km" in page.text and "must be served" in page.text
     assert "solver by hand, seed 7" in page.text
 
 

@@ -99,6 +99,35 @@ def test_repair_is_repeatable(instances: Instances) -> None:
     assert routes(pair, instances, 1) == routes(pair, instances, 1)
 
 
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_schedules_are_told_as_they_are_found(instances: Instances, batch_size: int) -> None:
+    """Each under the row that it is of, whatever the batch; and being told changes nothing."""
+    pair = make_pair(decode="augment", samples=32, repair=True, batch_size=batch_size)
+    expected = [result.schedule for result in pair.solve(instances, seed=1)]
+    told: dict[int, list[Schedule]] = {row: [] for row in range(len(instances))}
+    pair.on_incumbent = lambda row, schedule: told[row].append(schedule)
+    assert [result.schedule for result in pair.solve(instances, seed=1)] == expected
+    for row, schedules in told.items():
+        values = [check_schedule(instances, row, schedule).objective for schedule in schedules]
+        assert len(values) >= 2 and schedules[-1] == expected[row] and max(values) == values[-1]
+
+
+def test_who_is_told_may_end_the_search(instances: Instances) -> None:
+    pair = make_pair(decode="augment", samples=32, repair=True)
+    before = pair._report
+
+    def stop(row: int, schedule: Schedule) -> None:
+        raise InterruptedError("enough")
+
+    pair.on_incumbent = stop
+    with pytest.raises(InterruptedError, match="enough"):
+        pair.solve(instances, seed=1)
+    # Nothing of it is left on the solver.
+    assert pair._report is before
+    pair.on_incumbent = None
+    assert routes(pair, instances, 1) == routes(make_pair(decode="augment", samples=32, repair=True), instances, 1)
+
+
 def test_threads_change_nothing(instances: Instances, monkeypatch: pytest.MonkeyPatch) -> None:
     pair = make_pair(decode="sampling", samples=16, repair=True)
     alone = routes(pair, instances)

@@ -31,8 +31,8 @@ def shell_commands() -> list[list[str]]:
     for page in PAGES:
         text = (ROOT / page).read_text(encoding="utf-8").replace("\\\n", " ")
         for block in re.findall(r"```(?:bash|sh)\n(.*?)```", text, flags=re.DOTALL):
-            lines = [shlex.split(line, comments=True) for line in block.splitlines()]
-            found += [words for words in lines if words[:1] == ["sb3-uav"]]
+            lines = [line for line in block.splitlines() if line.startswith("sb3-uav ")]
+            found += [shlex.split(line, comments=True) for line in lines]
     return found
 
 

@@ -142,7 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from sb3_uav.evaluation.benchmarks import read_best_known, read_folder
     from sb3_uav.evaluation.benchmarks.report import print_report, report
     from sb3_uav.evaluation.benchmarks.run import run_benchmark
-    from sb3_uav.evaluation.benchmarks.summary_file import notes, repairs
+    from sb3_uav.evaluation.benchmarks.summary_file import notes, omissions, repairs
     from sb3_uav.solvers.unavailable import UnavailableSolver
 
     # What may be missing or wrong is found before the long run, not after it.
@@ -174,7 +174,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     name = args.folder.resolve().name
     print_report(report(rows), f"{name}: {len(benchmark.instances)} instances, gap to the best-known values")
-    for line in (*notes(benchmark, best_known), *repairs(rows)):
+    for line in (*notes(benchmark, best_known), *repairs(rows), *omissions(rows)):
         print(line)
     files = [args.out / "summary.md", *_draw_curve(rows, args.out, name)]
     print(*(str(path) for path in files))

@@ -22,11 +22,14 @@ _FORWARDED = {
     "plot-from-file": ("sb3_uav.zoo.plots:plot_from_file", "figures from a file of all-plots (all flags of rl_zoo3's)"),
     "push-to-hub": ("sb3_uav.zoo.push_to_hub:push_to_hub", "a trained agent and its router to the Hugging Face Hub"),
     "load-from-hub": ("sb3_uav.zoo.load_from_hub:load_from_hub", "an agent of the Hugging Face Hub into a log folder"),
+    "solve": ("sb3_uav.cli.solve:main", "plan missions over a list of tasks: CSV, GeoJSON, .plan, ... to missions that fly"),
+    "replan": ("sb3_uav.cli.replan:main", "plan a mission again while its UAVs are in the air"),
     "evaluate": ("sb3_uav.cli.evaluate:main", "evaluate zips and solvers on the same instances"),
     "bench": ("sb3_uav.cli.bench:main", "compare solvers with the best-known values of public benchmarks"),
     "anytime": ("sb3_uav.cli.anytime:main", "draw objective against time from an evaluation"),
     "reproduce": ("sb3_uav.cli.reproduce:main", "make the tables and figures of the paper"),
     "compare": ("sb3_uav.cli.compare:main", "train algorithms at an equal budget and compare them"),
+    "serve": ("sb3_uav.cli.serve:main", "plan missions in a browser, and by a JSON API"),
     "demo": ("sb3_uav.cli.demo:main", "train and evaluate a small scenario in a few minutes"),
 }
 

@@ -23,10 +23,28 @@ def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
     :return: The arrays by name
     :raises ValueError: If it is not an intact ``.npz``, or holds anything but plain arrays
     """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); {advice}.") from error
+    with stream:
+        return read_npz_stream(stream, str(path), advice)
+
+
+def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np.ndarray]:
+    """
+    The same for a file that is open, or in memory.
+
+    :param stream: Its content
+    :param source: Its name, for errors
+    :param advice: As of :func:`read_npz`
+    :return: The arrays by name
+    :raises ValueError: As :func:`read_npz`
+    """
     place = ""
     try:
-        # Not np.load(path), which would also read a .npy or offer to unpickle whatever else it finds.
-        with path.open("rb") as stream, zipfile.ZipFile(stream) as file:
+        # Not np.load, which would also read a .npy or offer to unpickle whatever else it finds.
+        with zipfile.ZipFile(stream) as file:
             arrays = {}
             for member in file.infolist():
                 place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
@@ -35,7 +53,7 @@ def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
     except Exception as error:
         # Given damaged bytes, zipfile and numpy's header parser (tokenize, ast) raise almost any exception, even MemoryError.
         found = str(error) or type(error).__name__
-        raise ValueError(f"{path}: not an intact .npz of plain arrays ({place}{found}); {advice}.") from error
+        raise ValueError(f"{source}: not an intact .npz of plain arrays ({place}{found}); {advice}.") from error
 
 
 def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:

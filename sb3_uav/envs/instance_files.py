@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +35,20 @@ def read_arrays(path: Path, known: Sequence[str]) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such instance file; give the path of an .npz written by Instances.save.")
     arrays = read_npz(path, "write it again")
+    check_array_names(arrays, known, str(path))
+    return arrays
+
+
+def check_array_names(arrays: Collection[str], known: Sequence[str], source: str) -> None:
+    """
+    :param arrays: Names of the arrays of a file
+    :param known: Names of the arrays that it may hold
+    :param source: Name of the file, for errors
+    :raises ValueError: If an array is missing or unknown
+    """
     unknown = [name for name in arrays if name not in known]
     if unknown:
-        raise ValueError(f"{path}: unknown array '{unknown[0]}'; {advice_on(unknown[0], known)}.")
+        raise ValueError(f"{source}: unknown array '{unknown[0]}'; {advice_on(unknown[0], known)}.")
     missing = _NEEDED - set(arrays)
     if missing:
-        raise ValueError(f"{path}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")
-    return arrays
+        raise ValueError(f"{source}: arrays {sorted(missing)} are missing; found {sorted(arrays)}.")

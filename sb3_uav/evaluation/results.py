@@ -51,6 +51,7 @@ class ResultRow:
     :param bound: A proven upper bound of the objective; possibly also of a solver that found no schedule
     :param status: ``ok``; ``infeasible`` if the checker refused the schedule; ``failed`` if the solver returned none
     :param message: What the checker or the solver said, in one line; with ``ok``, which tasks that must be served are not
+    :param unserved: How many tasks that must be served are not; None without a feasible schedule
     """
 
     solver: str
@@ -68,6 +69,7 @@ class ResultRow:
     bound: float | None
     status: str
     message: str
+    unserved: int | None = None
 
     @property
     def key(self) -> ResultKey:
@@ -75,9 +77,11 @@ class ResultRow:
 
 
 RESULT_COLUMNS = tuple(field.name for field in fields(ResultRow))
-_WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size"}
+# Of earlier versions, whose results are read and resumed as well.
+_EARLIER_COLUMNS = tuple(name for name in RESULT_COLUMNS if name != "unserved")
+_WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size", "unserved"}
 _NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
-_OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound"}
+_OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound", "unserved"}
 
 
 def one_line(text: object) -> str:
@@ -92,10 +96,11 @@ def read_results(path: Path) -> list[ResultRow]:
     """
     :param path: A ``results.csv``; a last line that a crash cut short is left out
     :return: Its rows
-    :raises ValueError: If another program, or another version, wrote it, or it was damaged
+    :raises ValueError: If another program, or a later version, wrote it, or it was damaged
     """
     header, *lines = _whole_lines(path) or [""]
-    if header != ",".join(RESULT_COLUMNS):
+    columns = {",".join(names): names for names in (RESULT_COLUMNS, _EARLIER_COLUMNS)}.get(header)
+    if columns is None:
         raise ValueError(
             f"{path}: its columns are not those that this version writes ({header!r:.120}); "
             "choose another folder, or start over with --overwrite."
@@ -103,7 +108,7 @@ def read_results(path: Path) -> list[ResultRow]:
     rows = []
     for number, line in enumerate(lines, start=2):
         try:
-            rows.append(_parse_row(next(csv.reader([line], strict=True))))
+            rows.append(_parse_row(columns, next(csv.reader([line], strict=True))))
         except (ValueError, csv.Error, StopIteration) as error:
             raise ValueError(
                 f"{path}, line {number}: is damaged ({error}); correct or delete that line, or start over with --overwrite."
@@ -125,15 +130,20 @@ def _whole_lines(path: Path) -> list[str]:
         raise ValueError(f"{path}: is damaged ({error}); start over with --overwrite.") from error
 
 
-def _parse_row(cells: Sequence[str]) -> ResultRow:
+def _parse_row(columns: Sequence[str], cells: Sequence[str]) -> ResultRow:
     """
+    :param columns: Names of the columns
     :param cells: One line of ``results.csv``
     :return: The row
     :raises ValueError: If a cell has a wrong value
     """
-    if len(cells) != len(RESULT_COLUMNS):
-        raise ValueError(f"{len(cells)} cells instead of {len(RESULT_COLUMNS)}")
-    values: dict[str, Any] = dict(zip(RESULT_COLUMNS, cells, strict=True))
+    if len(cells) != len(columns):
+        raise ValueError(f"{len(cells)} cells instead of {len(columns)}")
+    values: dict[str, Any] = dict(zip(columns, cells, strict=True))
+    if "unserved" not in values:
+        # The message of a feasible schedule names them, one after the other.
+        message = values["message"]
+        values["unserved"] = (message.count(",") + 1 if message else 0) if values["status"] == OK else ""
     for name in _WHOLE_NUMBERS | _NUMBERS:
         if values[name] == "" and name in _OPTIONAL:
             values[name] = None

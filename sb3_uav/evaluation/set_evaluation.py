@@ -126,6 +126,7 @@ class SetEvaluation:
                 bound=bound,
                 status=status,
                 message=message,
+                unserved=None if report is None else len(report.unserved),
             ),
             line,
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_uav.common.files import replaced_when_complete, write_csv
 from sb3_uav.common.statistics import CONFIDENCE, confidence_halfwidth
-from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, RESULTS_FILE, ResultRow
+from sb3_uav.evaluation.results import FAILED, INFEASIBLE, RESULTS_FILE, ResultRow
 
 SUMMARY_CSV, SUMMARY_JSON = "summary.csv", "summary.json"
 # Solvers prove bounds up to rounding errors.
@@ -44,6 +44,8 @@ class SummaryRow:
     :param optimality_gap: See :func:`_optimality_gap`, in percent, with the best bounds of all solvers
     :param seconds: Mean wall time per instance
     :param batch_size: How many instances were solved at once (the largest batch)
+    :param n_unserved: How many tasks that must be served the feasible schedules leave out, all together. Means, gaps and
+        differences are of values alone
     :param violations: Infeasible schedules and wrong bounds, one line each
     :param failures: Reasons of failures with the number of instances, one line each
     :param unserved: On how many instances tasks that must be served are left out, if on any
@@ -68,6 +70,7 @@ class SummaryRow:
     optimality_gap: float
     seconds: float
     batch_size: int
+    n_unserved: int = 0
     violations: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
     unserved: tuple[str, ...] = ()
@@ -152,6 +155,7 @@ def summarize(
                 optimality_gap=_optimality_gap(objectives[solver], best_bounds),
                 seconds=_mean(seconds[~np.isnan(seconds)]),
                 batch_size=max(row.batch_size or 0 for row in rows),
+                n_unserved=sum(row.unserved or 0 for row in rows),
                 violations=(*_violations(rows), *_wrong_bounds(rows, best_found)),
                 failures=_failures(rows),
                 unserved=_unserved(rows),
@@ -212,7 +216,7 @@ def _unserved(rows: Sequence[ResultRow]) -> tuple[str, ...]:
     :param rows: Results of one solver
     :return: On how many instances it leaves tasks that must be served, because means of values do not show that
     """
-    n_rows = sum(row.status == OK and row.message != "" for row in rows)
+    n_rows = sum((row.unserved or 0) > 0 for row in rows)
     if n_rows == 0:
         return ()
     text = "leaves out tasks that must be served, so that its value is no measure of how good its schedules are"

@@ -71,6 +71,8 @@ def _table(rich: Any, rows: Sequence[SummaryRow]) -> Any:
         columns.append(("Batch", [str(row.batch_size or "-") for row in rows]))
     if any(row.n_feasible < row.n_instances for row in rows):
         columns.append(("Feasible", [f"{row.n_feasible}/{row.n_instances}" for row in rows]))
+    if any(row.n_unserved > 0 for row in rows):
+        columns.append(("Un-\nserved", [str(row.n_unserved) for row in rows]))
     for heading, _ in columns:
         table.add_column(heading, justify="right", no_wrap=True)
     for position, row in enumerate(rows):

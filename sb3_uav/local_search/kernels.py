@@ -189,9 +189,11 @@ def count_visited(plan):
 
 @njit(cache=True, nogil=True)
 def total_length(plan):
+    """The length of all tours, without UAVs that cannot fly: they stay where they are, however far away their end is."""
     total = 0.0
     for v in range(len(plan.tours)):
-        total += plan.tours[v].length
+        if plan.tours[v].size > 0 or plan.tours[v].length <= plan.tours[v].limit:
+            total += plan.tours[v].length
     return total
 
 

@@ -142,13 +142,14 @@ class LocalSearch:
         new, old = self.report(found), self.report(given)
         return found if (new.objective, -new.length) >= (old.objective, -old.length) else given
 
-    def insertion(self) -> Schedule:
+    def insertion(self, schedule: Schedule | None = None) -> Schedule:
         """
-        Cheapest insertion from empty tours: always the task that is worth most per added length.
+        Cheapest insertion: always the task that is worth most per added length. What is in a tour stays there, in its order.
 
+        :param schedule: The tours to begin with, feasible; empty ones when None
         :return: A feasible schedule
         """
-        plan = self._load(Schedule([]))
+        plan = self._load(Schedule([]) if schedule is None else schedule)
         kernels.fill_everywhere(plan)
         return self._unload(plan)
 

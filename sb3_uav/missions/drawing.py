@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.labels import (
     count,
     escaped,
-    flies,
     headline,
     ink_on,
     meters,
@@ -51,7 +51,7 @@ def plan_html(plan: Plan) -> str:
         look = uav_look(uav)
         lines.append(view.line(corners, uav_color(uav), look.dash_array))
         for row, does in ((0, "starts"), (-1, "ends")):
-            if np.any(corners[row]) and flies(route):
+            if np.any(corners[row]) and route.flies:
                 marks.append(view.site(corners[row], uav_color(uav), f"{route.uav.id} {does} here"))
         for place, (stop, point) in enumerate(zip(route.stops, corners[1:-1], strict=False), 1):
             must = bool(plan.tasks.must[stop])
@@ -73,7 +73,7 @@ def plan_html(plan: Plan) -> str:
         names.append(f'<tr><td></td><td colspan="2">and {count(len(plan.routes) - _MAX_ROWS, "more UAV")}</td></tr>')
     remarks = "".join(f"<div>{escaped(remark, _SENTENCE)}</div>" for remark in plan.remarks[:_MAX_ROWS])
     return (
-        f"<div><div><b>{escaped(plan.tasks.source)}</b>: {escaped(headline(plan), _SENTENCE)}</div>"
+        f"<div><div><b>{escaped(Path(plan.tasks.source).name)}</b>: {escaped(headline(plan), _SENTENCE)}</div>"
         f"{view.svg([*lines, *marks, view.depot(np.zeros(2))])}{outside}"
         f'<table style="border-collapse:collapse;margin:4px 0">{"".join(names)}</table>{remarks}</div>'
     )

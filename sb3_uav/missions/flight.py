@@ -36,6 +36,6 @@ class FlightOptions:
         if not 0 <= self.altitude_step_m <= 1_000:
             raise ValueError(f"altitude_step_m is {self.altitude_step_m:g}; give meters from 0 to 1000.")
 
-    def altitude_of(self, uav: int) -> float:
-        """:return: Altitude of a UAV, by its number from 0"""
-        return self.altitude_m + uav * self.altitude_step_m
+    def altitude_of(self, level: int) -> float:
+        """:return: Altitude in meters above the depot, by its number, see :meth:`~sb3_uav.missions.fleet.Fleet.level_of`"""
+        return self.altitude_m + level * self.altitude_step_m

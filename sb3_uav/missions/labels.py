@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -124,18 +125,25 @@ def why_skipped(skipped: Skipped) -> str:
     """:return: Why a task is left out, and how much range is missing"""
     if skipped.missing_m is None:
         return skipped.reason
-    missing = "less than 1 m" if skipped.missing_m < 1 else f"{skipped.missing_m:,.0f} m"
+    missing = "less than 1 m" if skipped.missing_m < 1 else at_least(skipped.missing_m)
     return f"{skipped.reason}: {missing} of range missing"
 
 
-def flies(route: Route) -> bool:
-    """:return: Whether a UAV leaves the ground"""
-    return bool(route.stops) or route.length_m > 0
+def at_least(length: float) -> str:
+    """:return: A length in meters or kilometers, rounded up, so that so much more range is enough"""
+    return f"{math.ceil(length)} m" if length < 10_000 else f"{math.ceil(length / 100) / 10:,.1f} km"
+
+
+def proof(plan: Plan) -> str:
+    """:return: The proven bound and how far the objective may be from it; empty without a bound"""
+    if plan.bound is None or plan.gap is None:
+        return ""
+    return f"proven bound {number(plan.bound)}, gap {100 * max(plan.gap, 0.0):.1f} %"
 
 
 def route_facts(route: Route) -> str:
     """:return: Stops, length and share of the range of a route, in short"""
-    if not flies(route):
+    if not route.flies:
         return "stays on the ground"
     return f"{count(len(route.stops), 'stop')}, {meters(route.length_m)}, {percent(route.share_of_range)} of range"
 
@@ -149,8 +157,8 @@ def headline(plan: Plan) -> str:
         f"{plan.n_served:,} of {count(len(plan.tasks), 'task')} served",
         f"{count(len(plan.fleet), 'UAV')}, {meters(plan.length_m)} in all",
     ]
-    if plan.bound is not None and plan.gap is not None:
-        parts.append(f"proven bound {number(plan.bound)}, gap {100 * max(plan.gap, 0.0):.1f} %")
+    if proof(plan):
+        parts.append(proof(plan))
     if plan.unserved:
         parts.append(f"{count(len(plan.unserved), 'task')} that must be served left out")
     return " · ".join(parts)

@@ -8,6 +8,9 @@ from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.missions.plan import Skipped
 
+# So many tasks are compared with all stops of a route at once.
+_BLOCK = 512
+
 
 def skipped_tasks(instance: Instances, schedule: Schedule) -> tuple[Skipped, ...]:
     """
@@ -28,11 +31,8 @@ def skipped_tasks(instance: Instances, schedule: Schedule) -> tuple[Skipped, ...
         detour = _lengths(points[left], starts[uav]) + _lengths(points[left], ends[uav]) + service[left]
         alone = np.minimum(alone, detour - limits[uav])
         stops = np.array([starts[uav], *points[list(route)], ends[uav]])
-        legs = np.hypot(*np.diff(stops, axis=0).T)
-        to_stops = np.hypot(*(points[left, None] - stops).transpose(2, 0, 1))
-        added = (to_stops[:, :-1] + to_stops[:, 1:] - legs).min(axis=1) + service[left]
-        used = legs.sum() + service[list(route)].sum()
-        on_route = np.minimum(on_route, used + added - limits[uav])
+        used = _lengths(stops[1:], stops[:-1]).sum() + service[list(route)].sum()
+        on_route = np.minimum(on_route, used + _detours(points[left], stops) + service[left] - limits[uav])
     return tuple(_skipped(int(task), prizes[task], *pair) for task, *pair in zip(left, alone, on_route, strict=True))
 
 
@@ -42,6 +42,19 @@ def _skipped(task: int, prize: float, alone: float, on_route: float) -> Skipped:
     if alone > 0:
         return Skipped(task, "out of reach", float(alone))
     return Skipped(task, "did not fit", max(float(on_route), 0.0))
+
+
+def _detours(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """
+    :param points: ``(n, 2)``
+    :param stops: ``(m, 2)``, a route from its start to its end
+    :return: ``(n,)``, how much longer the route gets by each of the points alone, where that is least
+    """
+    legs, detours = _lengths(stops[1:], stops[:-1]), np.empty(len(points))
+    for begin in range(0, len(points), _BLOCK):
+        to_stops = np.hypot(*(points[begin : begin + _BLOCK, None] - stops).transpose(2, 0, 1))
+        detours[begin : begin + _BLOCK] = (to_stops[:, :-1] + to_stops[:, 1:] - legs).min(axis=1)
+    return detours
 
 
 def _lengths(points: np.ndarray, other: np.ndarray) -> np.ndarray:

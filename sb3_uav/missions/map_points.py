@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_uav.missions.labels import flies
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.tasks import TaskList
 
@@ -97,4 +96,4 @@ def spacing_of(points: np.ndarray) -> float:
 
 def _grounded(route: Route, points: np.ndarray) -> np.ndarray:
     """Do not draw a flight to an end that an idle UAV does not fly."""
-    return points if flies(route) else points[[0, 0]]
+    return points if route.flies else points[[0, 0]]

@@ -25,6 +25,7 @@ class Route:
     :param legs_m: ``(n_stops + 1,)``, length of every leg in meters, geodesic for latitudes and longitudes; 0 where the UAV
         stays on the ground
     :param service_m: What serving the stops costs, in meters of its range
+    :param service_s: How long serving the stops takes, in seconds
     """
 
     uav: Uav
@@ -32,15 +33,21 @@ class Route:
     points: np.ndarray
     legs_m: np.ndarray
     service_m: float
+    service_s: float = 0.0
+
+    @property
+    def flies(self) -> bool:
+        """Whether the UAV leaves its place: it has stops, or it has to get to where it lands."""
+        return bool(self.stops) or self.length_m > 0
 
     @property
     def length_m(self) -> float:
-        """Metres flown."""
+        """Meters flown."""
         return math.fsum(self.legs_m)
 
     @property
     def used_m(self) -> float:
-        """Metres of the range that are used, with the service of the stops."""
+        """Meters of the range that are used, with the service of the stops."""
         return self.length_m + self.service_m
 
     @property
@@ -51,7 +58,7 @@ class Route:
     @property
     def seconds(self) -> float | None:
         """Time in the air, without takeoff and landing; None if nobody said how fast it flies."""
-        return None if self.uav.speed_mps is None else self.used_m / self.uav.speed_mps
+        return None if self.uav.speed_mps is None else self.length_m / self.uav.speed_mps + self.service_s
 
 
 @dataclass(frozen=True)
@@ -61,8 +68,8 @@ class Skipped:
 
     :param task: Index of the task
     :param reason: Why
-    :param missing_m: How many more meters of range the UAV would need that is nearest to serving it; None where it does not
-        apply
+    :param missing_m: How many more meters the UAV that is nearest to serving it would have to be allowed to use, see
+        :attr:`~sb3_uav.missions.fleet.Uav.usable_m`; None where it does not apply
     """
 
     task: int
@@ -85,7 +92,11 @@ class Plan:
     :param seed: Seed of the solver
     :param seconds: Wall time of the solver
     :param bound: A proven upper bound of the objective; None if there is none
+    :param past_tasks: Names of tasks that earlier plans of this mission had, done or dropped since
+    :param past_uavs: Names of UAVs that earlier plans had, lost since
+    :param notes: What had to be assumed in making it, a sentence each; remarks begin with them
     :param remarks: What a person should know before flying it, a sentence each
+    :param time_limit: Seconds that the solver was given; None if nobody said
     """
 
     tasks: TaskList
@@ -98,7 +109,11 @@ class Plan:
     seed: int
     seconds: float
     bound: float | None = None
+    past_tasks: tuple[str, ...] = ()
+    past_uavs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    time_limit: float | None = None
 
     @property
     def gap(self) -> float | None:
@@ -111,7 +126,7 @@ class Plan:
 
     @property
     def length_m(self) -> float:
-        """Metres flown by all UAVs."""
+        """Meters flown by all UAVs."""
         return math.fsum(route.length_m for route in self.routes)
 
     def _repr_html_(self) -> str:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from sb3_uav.common.files import write_atomically
-from sb3_uav.envs.schedule import Schedule
+from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
+from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.plan import Plan
+from sb3_uav.missions.readers.checks import check_fleet, check_tasks
 from sb3_uav.missions.search import make_plan
 from sb3_uav.missions.tasks import TaskList
 
@@ -51,6 +54,8 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
                 "start": None if uav.start is None else list(uav.start),
                 "end": None if uav.end is None else list(uav.end),
                 "reserve_percent": uav.reserve_percent,
+                "full_range_m": uav.full_range_m,
+                "level": uav.level,
             }
             for uav in plan.fleet
         ],
@@ -59,6 +64,7 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
         "seed": plan.seed,
         "seconds": plan.seconds,
         "bound": plan.bound,
+        "past": {"tasks": list(plan.past_tasks), "uavs": list(plan.past_uavs)},
     }
 
 
@@ -73,6 +79,8 @@ def plan_from_json(data: Any, source: str) -> Plan:
         raise ValueError(f'{source}: this is not a plan of sb3-uav solve, which has "format": "sb3-uav mission".')
     if data.get("version") != _VERSION:
         raise ValueError(f"{source}: version is {data.get('version')!r}, but this release reads {_VERSION}; plan anew.")
+    if data.get("system") not in get_args(System):
+        raise ValueError(f"{source}: system is {data.get('system')!r:.40}; it is one of {', '.join(get_args(System))}.")
     try:
         tasks = TaskList.of(
             [task["id"] for task in data["tasks"]],
@@ -80,7 +88,7 @@ def plan_from_json(data: Any, source: str) -> Plan:
             data["system"],
             [task["value"] for task in data["tasks"]],
             [task["service_s"] for task in data["tasks"]],
-            [task["must"] for task in data["tasks"]],
+            [_flag(task["must"]) for task in data["tasks"]],
             depot=data["depot"],
             altitudes=np.array(
                 [np.nan if task["altitude_m"] is None else task["altitude_m"] for task in data["tasks"]], float
@@ -96,19 +104,47 @@ def plan_from_json(data: Any, source: str) -> Plan:
                 _point(uav["start"]),
                 _point(uav["end"]),
                 float(uav["reserve_percent"]),
+                None if uav.get("full_range_m") is None else float(uav["full_range_m"]),
+                None if uav.get("level") is None else int(uav["level"]),
             )
             for uav in data["fleet"]
         ]
         number = {name: task for task, name in enumerate(tasks.ids)}
         schedule = Schedule([[number[str(name)] for name in route] for route in data["routes"]])
+        past = data.get("past") or {}
+        past_tasks, past_uavs = (tuple(str(name) for name in past.get(kind) or ()) for kind in ("tasks", "uavs"))
+        bound = None if data.get("bound") is None else float(data["bound"])
         solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
-    except (KeyError, TypeError, IndexError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
-    return make_plan(tasks, Fleet(tuple(uavs), source), schedule, solver, seed, seconds)
+    if tasks.depot is None:
+        raise ValueError(f"{source}: the plan has no depot; plan anew.")
+    if tasks.system == "wgs84" and not (np.abs(tasks.depot) <= (90.0, 180.0)).all():
+        raise ValueError(f"{source}: depot is {tasks.depot.tolist()}; give latitude and longitude in degrees.")
+    for what, names in (("tasks", tasks.ids), ("UAVs", tuple(uav.id for uav in uavs))):
+        if len(set(names)) < len(names):
+            raise ValueError(f"{source}: two {what} have the same name; give each its own.")
+    fleet = Fleet(tuple(uavs), source)
+    check_tasks(replace(tasks, source=source), allow_duplicates=True)
+    # Of a mission that was planned again: its UAVs may be in the air.
+    check_fleet(fleet, is_flying=True)
+    try:
+        plan = make_plan(tasks, fleet, schedule, solver, seed, seconds)
+    except InfeasibleScheduleError as error:
+        raise InfeasibleScheduleError(f"{source}: {error}") from error
+    if bound is not None and not plan.objective <= bound < np.inf:
+        raise ValueError(f"{source}: bound is {bound:g}, but it is finite and at least {plan.objective:g}, the objective.")
+    return replace(plan, bound=bound, past_tasks=past_tasks, past_uavs=past_uavs)
 
 
 def _point(given: Any) -> tuple[float, float] | None:
     return None if given is None else (float(given[0]), float(given[1]))
+
+
+def _flag(given: Any) -> bool:
+    if not isinstance(given, bool):
+        raise TypeError(f"{given!r:.40} is neither true nor false")
+    return given
 
 
 def save_plan(plan: Plan, path: Path) -> None:
@@ -129,6 +165,6 @@ def load_plan(path: Path) -> Plan:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: this is not JSON ({error}).") from error
     return plan_from_json(data, str(path))

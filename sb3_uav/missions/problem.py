@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.missions.fleet import Fleet
+from sb3_uav.missions.readers.checks import check_fits
 from sb3_uav.missions.tasks import TaskList
 
 
@@ -18,7 +19,7 @@ def service_speed(tasks: TaskList, fleet: Fleet) -> float:
 
     :param tasks: The tasks
     :param fleet: The UAVs
-    :return: Metres per second; 0 if no task takes time
+    :return: Meters per second; 0 if no task takes time
     :raises ValueError: If a task takes time and the speed of a UAV is not known
     """
     if not (tasks.service_s > 0).any():
@@ -38,8 +39,10 @@ def make_instance(tasks: TaskList, fleet: Fleet) -> Instances:
     :param tasks: ``n`` tasks with a depot
     :param fleet: ``V`` UAVs
     :return: One instance in meters, the depot at the origin for latitudes and longitudes
-    :raises ValueError: If there is no depot, or the speed of a UAV is needed and not known
+    :raises ValueError: If there is no depot, the speed of a UAV is needed and not known, or starts or ends of UAVs are not
+        in the coordinates of the tasks
     """
+    check_fits(tasks, fleet)
     if tasks.depot is None:
         raise ValueError(f"{tasks.source}: there is no depot; flag a row as the depot, or give --depot.")
     coordinates = tasks.coordinates()

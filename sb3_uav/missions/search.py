@@ -15,6 +15,7 @@ from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.leftovers import skipped_tasks
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.problem import make_instance, service_speed
+from sb3_uav.missions.readers.checks import check_fits, check_fleet, check_tasks
 from sb3_uav.missions.remarks import remarks_on
 from sb3_uav.missions.tasks import TaskList
 
@@ -42,6 +43,7 @@ def solve(
     time_limit: float = DEFAULT_SECONDS,
     seed: int = 0,
     on_plan: Callable[[Plan], None] | None = None,
+    on_start: Callable[[], None] | None = None,
 ) -> Plan:
     """
     Plan the mission.
@@ -52,6 +54,7 @@ def solve(
     :param time_limit: Seconds
     :param seed: Seed of the solver
     :param on_plan: Called with every better plan as soon as it is known, possibly in another thread
+    :param on_start: Called when the solver is loaded and its time begins
     :return: The best plan, accepted by the checker, with lengths measured anew in the coordinates of the user
     :raises ValueError: If the input is wrong; the message names the file and the row
     :raises InfeasibleScheduleError: If the solver is at fault
@@ -61,14 +64,23 @@ def solve(
     fleet = tasks.fleet if fleet is None else fleet
     if fleet is None:
         raise ValueError(f"{tasks.source}: nothing says which UAVs there are; give a fleet.")
+    if not 0 < time_limit < math.inf:
+        raise ValueError(f"time_limit is {time_limit:g}; give a number of seconds above 0.")
+    # Neither need come from a file whose reader has seen to it. UAVs may be in the air.
+    check_tasks(tasks, allow_duplicates=True)
+    check_fleet(fleet, is_flying=True)
+    check_fits(tasks, fleet)
     instance = make_instance(tasks, fleet)
     chosen = make_solver(solver or default_spec(instance, time_limit), device="cpu")
     chosen.check(instance)
     chosen.prepare()
+    if on_start is not None:
+        on_start()
     start = time.perf_counter()
 
     def plan_of(schedule: Schedule) -> Plan:
-        return make_plan(tasks, fleet, schedule, chosen.name, seed, time.perf_counter() - start, instance=instance)
+        plan = make_plan(tasks, fleet, schedule, chosen.name, seed, time.perf_counter() - start, instance=instance)
+        return replace(plan, time_limit=time_limit)
 
     if on_plan is not None:
         best: list[tuple[int, float, float]] = []
@@ -144,6 +156,6 @@ def measured_routes(tasks: TaskList, fleet: Fleet, routes: Sequence[Sequence[int
         legs = coordinates.leg_lengths(points)
         if not stops and legs.sum() > uav.usable_m:
             legs = np.zeros(1)
-        service = math.fsum(tasks.service_s[list(stops)]) * speed
-        measured.append(Route(uav, tuple(stops), points, legs, service))
+        seconds = math.fsum(tasks.service_s[list(stops)])
+        measured.append(Route(uav, tuple(stops), points, legs, seconds * speed, seconds))
     return tuple(measured)

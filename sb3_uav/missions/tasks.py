@@ -28,6 +28,8 @@ class TaskList:
     :param fleet: The UAVs, if the file says which there are
     :param places: Where in the file every task stands, such as ``"row 7"``, for messages
     :param source: Name of the file, for messages
+    :param sha256: Digest of the file in hexadecimal digits; empty if there is none
+    :param notes: What the file says and the tasks do not, a sentence each
     """
 
     ids: tuple[str, ...]
@@ -42,6 +44,8 @@ class TaskList:
     fleet: Fleet | None = None
     places: tuple[str, ...] = ()
     source: str = "tasks"
+    sha256: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.altitudes) != len(self.ids):

@@ -12,7 +12,7 @@ from sb3_uav.common.random_streams import mixed_state
 from sb3_uav.envs.allocation import plan_tours
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.routing import Router
-from sb3_uav.envs.symmetries import N_SYMMETRIES
+from sb3_uav.envs.symmetries import N_SYMMETRIES, combine, reflect, standard_pose
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.solvers.seen_instances import SeenInstance, Shown, View
 from sb3_uav.solvers.shortlists import Block
@@ -35,13 +35,14 @@ _N_REVISITED, REVISITED_PART = 4, 0.25
 _HURRIED_BLOCK, _HURRIED_VIEWS = 16, 2
 
 
-def _view_of(number: int) -> View:
+def _view_of(number: int, pose: int = 0) -> View:
     """
     :param number: Number of an allocation in augmentation, from 0
+    :param pose: Symmetry to begin with
     :return: Its view: after all symmetries in both directions, the sweep starts at another gap
     """
     turn, number = divmod(number, _N_VIEWS)
-    return View(number // _N_DIRECTIONS, turn * _N_DIRECTIONS + number % _N_DIRECTIONS)
+    return View(combine(pose, number // _N_DIRECTIONS), turn * _N_DIRECTIONS + number % _N_DIRECTIONS)
 
 
 class Allocations(NamedTuple):
@@ -120,12 +121,19 @@ class Decoder:
         n_allocations = self.samples - (_N_REVISITED * n_tours if n_tours > 1 else 0)
         size = _HURRIED_VIEWS if hurry else _N_VIEWS
         values, assignments = [], []
+        # Mirror images get the same random numbers in the same views. Too few samples for all views start with the instance
+        # as it is, so that they are not worse than the greedy allocation.
+        poses = standard_pose(instances) if n_allocations >= _N_VIEWS else [0] * len(instances)
         seen = self._seen(instances)
         for first in range(0, n_allocations, size):
-            views = [_view_of(number) for number in range(first, min(first + size, n_allocations))]
+            numbers = range(first, min(first + size, n_allocations))
             looks = [
-                self.look(instance.show(views), _random_generator(instances, seed, row, first), int(first >= _N_VIEWS))
-                for instance, row in zip(seen, rows, strict=True)
+                self.look(
+                    instance.show([_view_of(number, pose) for number in numbers]),
+                    _random_generator(instances, seed, row, first),
+                    int(first >= _N_VIEWS),
+                )
+                for instance, pose, row in zip(seen, poses, rows, strict=True)
             ]
             block = self._plan(looks)
             values.append(block.value)
@@ -137,7 +145,8 @@ class Decoder:
             blocks = []
             for i, row in enumerate(rows):
                 generator = _random_generator(instances, seed, row, self.samples)
-                again = plan_tours(instances[i], assignment[i, best[i]][None], self._several_tours(n_tours, generator))
+                standing = reflect(instances[i], poses[i])
+                again = plan_tours(standing, assignment[i, best[i]][None], self._several_tours(n_tours, generator))
                 blocks.append(Block(again.value, again.tours))
             yield Block.concatenate(blocks)
 

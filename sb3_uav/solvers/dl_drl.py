@@ -30,7 +30,8 @@ class DLDRL(BatchedSolver):
     :param router: The lower level's policy
     :param decode: ``"greedy"``, ``"sampling"`` to keep the best of several sampled allocations, or ``"augment"`` to spend the
         samples on views of the instance (its symmetries) and on more tours for the UAVs of the best allocations. An allocator
-        with ``sweep`` gets the tasks in both directions and from several starts, except with ``"greedy"``
+        with ``sweep`` gets the tasks in both directions and from several starts, except with ``"greedy"``. With enough
+        samples for all views, mirror images and quarter turns of an instance get the same schedules
     :param samples: Number of tours that are planned for every UAV of an instance
     :param batch_size: How many instances to solve at once; as many as memory allows when None, and never more
     :param name: Label in tables and files; describes the decoding when None

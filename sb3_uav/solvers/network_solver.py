@@ -32,7 +32,7 @@ class BatchedSolver(Solver):
         if batch_size is not None and batch_size < 1:
             raise ValueError(f"batch_size is {batch_size}; give at least 1.")
         self.batch_size = batch_size
-        self._report: Callable[[int, Schedule], None] = lambda place, schedule: None
+        self._report: Callable[[int, Schedule], None] = _tell_nobody
 
     @abstractmethod
     def rows_that_fit(self, instances: Instances) -> int:
@@ -73,7 +73,11 @@ class BatchedSolver(Solver):
                 batch = group[taken]
                 n_tasks = max(int(batch.task_mask.sum(1).max()), 1)
                 self._report = self._reporter(counting, rows, taken)
-                found = self.solve_batch(batch.trim(n_tasks), [rows[place] for place in taken], seed, time_limit)
+                try:
+                    found = self.solve_batch(batch.trim(n_tasks), [rows[place] for place in taken], seed, time_limit)
+                finally:
+                    # It holds the instances and what the caller has given, and is of no use to another batch.
+                    self._report = _tell_nobody
                 seconds = (time.perf_counter() - start) / len(taken)
                 for place, schedule in zip(taken, found, strict=True):
                     yield rows[place], SolverResult(counting.schedule(place, schedule), seconds, len(taken))
@@ -87,12 +91,16 @@ class BatchedSolver(Solver):
         """
         on_incumbent = self.on_incumbent
         if on_incumbent is None:
-            return lambda place, schedule: None
+            return _tell_nobody
         return lambda place, schedule: on_incumbent(rows[taken[place]], counting.schedule(taken[place], schedule))
 
     def solve(self, instances: Instances, time_limit: float | None = None, seed: int = 0) -> list[SolverResult]:
         results = dict(self.solve_rows(instances, range(len(instances)), time_limit, seed))
         return [results[row] for row in range(len(instances))]
+
+
+def _tell_nobody(place: int, schedule: Schedule) -> None:
+    """What solvers report to if nobody has set :attr:`~sb3_uav.solvers.base.Solver.on_incumbent`."""
 
 
 def parameters_hash(policy: EpisodicPolicy) -> str:

@@ -66,6 +66,7 @@ class InstanceSets:
         :raises ValueError: If a size is not allowed or stands twice
         """
         found: dict[str, Instances] = {}
+        kinds: set[tuple[int, int, str]] = set()
         for size in sizes:
             if len(size) not in (3, 4) or not all(isinstance(number, int) and number >= 1 for number in size[:3]):
                 raise ValueError(
@@ -75,8 +76,13 @@ class InstanceSets:
             n_uavs, n_tasks, n_instances = size[:3]
             distribution = str(size[3]) if len(size) == 4 else "uniform"
             name = f"U{n_uavs}-N{n_tasks}" + (f"-{distribution}" if len(size) == 4 else "")
-            if name in found:
-                raise ValueError(f"sizes: {n_uavs} UAVs and {n_tasks} tasks stand twice; name every set once.")
+            kind = (n_uavs, n_tasks, distribution)
+            if kind in kinds:
+                # Also where only one of them names the distribution: both would draw the same instances.
+                raise ValueError(
+                    f"sizes: {n_uavs} UAVs and {n_tasks} tasks stand twice ({distribution}); name every set once."
+                )
+            kinds.add(kind)
             generator = make_generator(n_tasks, n_uavs, max_distance, distribution)
             found[name] = generator(n_instances, source(n_uavs, n_tasks))
         if not found:

@@ -60,7 +60,7 @@ def read_folder(path: Path, only: Sequence[str] = (), known: Sequence[str] = ())
     unsupported: dict[str, str] = {}
     skipped: list[Path] = []
     for file in files:
-        if only and file.suffix != ".npz" and not _matches(file.stem, only):
+        if only and file.suffix.lower() != ".npz" and not _matches(file.stem, only):
             continue
         place = file.parent.relative_to(root).as_posix()
         group = place if len(folders) > 1 and place != "." else file.stem.partition(".")[0]

@@ -45,15 +45,16 @@ class GapRow:
     :param objective: Total value of the routes that count, under the rule of the file; with the score of the depot, if the
         file gives it one
     :param gap: How far the objective is below the best-known value, in percent of that; negative above it. 0 if both are 0
-    :param reached: Whether the objective is at least the best-known value
-    :param better: Whether it is more
+    :param reached: Whether the objective is at least the best-known value, and nothing is left out that must be served
+    :param better: Whether it is more, and nothing is left out that must be served
     :param length: Total length of these routes, under the rule of the file
     :param euclidean_objective: What the solver found with Euclidean lengths, with the score of the depot
     :param n_dropped: How many tasks the rule of the file made drop
     :param n_added: How many tasks were put in because that rule admits more, on demand
     :param seconds: Wall time of the solver: that of its batch, divided by the size of the batch
     :param batch_size: How many instances were solved at once
-    :param message: Why there is no objective
+    :param message: Why there is no objective; with one, which tasks that must be served are not
+    :param unserved: How many tasks that must be served the routes that count leave out; None without an objective
     """
 
     instance: str
@@ -74,6 +75,7 @@ class GapRow:
     seconds: float | None
     batch_size: int | None
     message: str
+    unserved: int | None = None
 
 
 GAP_COLUMNS = tuple(field.name for field in fields(GapRow))
@@ -134,7 +136,7 @@ def _compared(
     :return: The comparison, and the schedule that counts
     """
     status, message = result.status, result.message
-    objective = length = None
+    objective = length = unserved = None
     counted = schedule
     n_dropped = n_added = 0
     if schedule is not None:
@@ -145,8 +147,10 @@ def _compared(
         else:
             found, kept = ({task for route in of.routes for task in route} for of in (schedule, counted))
             n_dropped, n_added = len(found - kept), len(kept - found)
+            unserved = len(_unserved(instance, counted))
     tolerance = _TOLERANCE * max(1.0, best_known or 0.0)
-    known = objective is not None and best_known is not None
+    # A larger value does not make up for what must be served.
+    known = objective is not None and best_known is not None and unserved == 0
     difference = (objective or 0.0) - (best_known or 0.0)
     row = GapRow(
         instance=instance.name,
@@ -167,8 +171,18 @@ def _compared(
         seconds=result.seconds,
         batch_size=result.batch_size,
         message=message,
+        unserved=unserved,
     )
     return row, counted
+
+
+def _unserved(instance: BenchmarkInstance, schedule: Schedule) -> list[int]:
+    """:return: Numbers in the file of the tasks that must be served and that the schedule leaves out"""
+    must_serve = instance.instances.must_serve
+    if must_serve is None:
+        return []
+    served = {task for route in schedule.routes for task in route}
+    return [node for task, node in enumerate(instance.nodes) if must_serve[0, task] and task not in served]
 
 
 def _counted(instance: BenchmarkInstance, schedule: Schedule, use_rounding: bool) -> tuple[Schedule, float, float]:
@@ -192,7 +206,8 @@ def _counted(instance: BenchmarkInstance, schedule: Schedule, use_rounding: bool
 
 
 def _route_line(instance: BenchmarkInstance, row: GapRow, schedule: Schedule) -> dict[str, Any]:
-    """:return: A line of ``routes.jsonl``"""
+    """:return: A line of ``routes.jsonl``; ``unserved`` only if a task that must be served is not"""
+    unserved = _unserved(instance, schedule)
     return {
         "instance": row.instance,
         "solver": row.solver,
@@ -201,6 +216,7 @@ def _route_line(instance: BenchmarkInstance, row: GapRow, schedule: Schedule) ->
         "objective": row.objective,
         "length": row.length,
         "routes": [[instance.nodes[task] for task in route] for route in schedule.routes],
+        **({"unserved": unserved} if unserved else {}),
     }
 
 

@@ -116,7 +116,10 @@ def _check_sections(path: Path, text: str, n_nodes: int) -> None:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        if "_SECTION" in line or words[0] == "EOF":
+        # As vrplib, which reads nothing after it.
+        if "EOF" in line:
+            break
+        if "_SECTION" in line:
             section = line.strip(" :\t")
             found[section] = found.get(section, 0)
         elif section in _SECTIONS:

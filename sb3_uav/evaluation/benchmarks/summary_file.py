@@ -61,6 +61,21 @@ def repairs(rows: Sequence[GapRow]) -> list[str]:
     return lines
 
 
+def omissions(rows: Sequence[GapRow]) -> list[str]:
+    """
+    :param rows: Gaps
+    :return: Which solvers leave out tasks that must be served, because means of values do not show that, one sentence each
+    """
+    lines = []
+    for solver in dict.fromkeys(row.solver for row in rows):
+        own = [row for row in rows if row.solver == solver]
+        count = sum((row.unserved or 0) > 0 for row in own)
+        if count:
+            what = "results leave out tasks that must be served, which gaps do not show and no value makes up for"
+            lines.append(f"{solver}: {count} of {len(own)} {what}; see unserved in {GAPS_FILE}.")
+    return lines
+
+
 def summary_text(benchmark: BenchmarkFolder, best_known: Mapping[str, float], rows: Sequence[GapRow]) -> str:
     """
     :param benchmark: The benchmark
@@ -84,7 +99,7 @@ def summary_text(benchmark: BenchmarkFolder, best_known: Mapping[str, float], ro
     if any(0 < row.n_compared < row.n_results for row in table):
         # The star is none of Markdown's.
         lines += ["", "\\" + ABOUT_PARTIAL + "."]
-    for line in (*notes(benchmark, best_known), *repairs(rows)):
+    for line in (*notes(benchmark, best_known), *repairs(rows), *omissions(rows)):
         lines += ["", line]
     better = [row for row in rows if row.better]
     if better:

@@ -6,6 +6,7 @@ import html
 import itertools
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -13,7 +14,6 @@ import numpy as np
 from sb3_uav.common.optional import require
 from sb3_uav.missions.labels import (
     count,
-    flies,
     headline,
     ink_on,
     number,
@@ -108,20 +108,20 @@ def _tour(plan: Plan, uav: int, points: MapPoints, size: float) -> dict[str, Any
     ]
     return {
         "mode": "lines+markers" if size >= NUMBERED_STOP else "lines",
-        "x": _rounded(path[:, 0]) if flies(route) else [],
-        "y": _rounded(path[:, 1]) if flies(route) else [],
+        "x": _rounded(path[:, 0]) if route.flies else [],
+        "y": _rounded(path[:, 1]) if route.flies else [],
         **_of_uav(plan, uav),
         "showlegend": False,
         "line": _line(uav),
         "marker": {
             "symbol": "arrow",
             "angleref": "previous",
-            "size": [_ARROW * (point % 2) for point in range(len(path))] if flies(route) else [],
+            "size": [_ARROW * (point % 2) for point in range(len(path))] if route.flies else [],
             "color": uav_color(uav),
             "opacity": 1,
             "line": {"width": 0},
         },
-        "text": hover if flies(route) else [],
+        "text": hover if route.flies else [],
         "hoverinfo": "text",
         "meta": {"role": "tour", "uav": uav},
     }
@@ -240,7 +240,7 @@ def _own_sites(plan: Plan, uav: int) -> Iterator[tuple[str, str]]:
         return
     if start is not None:
         yield "start", _site(plan, route, "starts")
-    if end is not None and flies(route):
+    if end is not None and route.flies:
         yield "end", _site(plan, route, "ends")
 
 
@@ -342,7 +342,11 @@ def _layout(plan: Plan, points: MapPoints) -> dict[str, Any]:
         ranges = [{"range": [float(low[row] - margin), float(high[row] + margin)]} for row in (0, 1)]
     return {
         "template": "none",
-        "title": {"text": f"{_text(plan.tasks.source)}<br><sup>{headline(plan)}</sup>", "x": 0.02, "xanchor": "left"},
+        "title": {
+            "text": f"{_text(Path(plan.tasks.source).name)}<br><sup>{headline(plan)}</sup>",
+            "x": 0.02,
+            "xanchor": "left",
+        },
         "font": {"family": FONT, "size": 13, "color": "#1d2125"},
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#fafbfc",

@@ -17,7 +17,6 @@ from sb3_uav.missions.labels import (
     count,
     duration,
     escaped,
-    flies,
     headline,
     meters,
     number,
@@ -75,7 +74,7 @@ def map_page(plan: Plan) -> str:
             "form-action 'none'",
         ]
     )
-    title = escaped(plan.tasks.source)
+    title = escaped(Path(plan.tasks.source).name)
     body = "\n".join(
         [
             f"<h1>{title}</h1>",
@@ -183,7 +182,7 @@ def _routes_table(plan: Plan) -> str:
             *[meters(route.service_m)] * has_service,
             meters(route.uav.range_m),
             _share(route),
-            *[duration(route.seconds) if route.seconds and flies(route) else ""] * has_time,
+            *[duration(route.seconds) if route.seconds and route.flies else ""] * has_time,
         ]
         rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     titles, lines = "".join(f"<th{words * (name == 'Used of it')}>{name}</th>" for name in head), "\n".join(rows)
