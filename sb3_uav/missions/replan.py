@@ -142,9 +142,14 @@ def _of_legs(n_kept: int, n_remaining: int) -> list[str]:
 
 
 def _of_gain(chosen: _Choice, plan: Plan) -> list[str]:
-    """:return: A note on what has been gained by changing routes further, if they have been"""
+    """:return: A note on what has been gained by changing routes further, or could have been"""
     if chosen.method not in ("repair", "search"):
-        return []
+        if chosen.forgone_value <= plan.objective:
+            return []
+        return [
+            f"Changing routes further would serve a value of {chosen.forgone_value:g} in place of {plan.objective:g}; "
+            f"--min-gain 0 does so."
+        ]
     gained = [f"a value of {plan.objective:g} in place of {chosen.calm_value:g}"]
     if len(plan.unserved) < chosen.calm_unserved:
         more = chosen.calm_unserved - len(plan.unserved)
@@ -201,6 +206,7 @@ class _Choice(NamedTuple):
     method: Method
     calm_unserved: int
     calm_value: float
+    forgone_value: float
 
 
 def _least_disruptive(instance: Instances, old: OldRoutes, time_limit: float, seed: int, min_gain: float) -> _Choice:
@@ -223,6 +229,7 @@ def _least_disruptive(instance: Instances, old: OldRoutes, time_limit: float, se
     inserted = search.insertion(residual)
     calm: tuple[Schedule, Method] = (inserted, "insertion") if rank(inserted) > rank(residual) else (residual, "kept")
     best, unserved, value = calm, *rank(calm[0])
+    forgone = value
     further: list[tuple[Method, Callable[[Schedule, float], Schedule]]] = [
         ("repair", lambda given, left: search.repair(given, left if time_limit > 0 else None)),
         ("search", lambda given, left: search.improve(given, left, seed)),
@@ -236,6 +243,8 @@ def _least_disruptive(instance: Instances, old: OldRoutes, time_limit: float, se
         new_unserved, new_value = rank(found)
         if new_unserved > unserved or (new_unserved == unserved and new_value > value * (1.0 + min_gain / 100.0)):
             best, unserved, value = (found, method), new_unserved, new_value
+        elif new_unserved == unserved:
+            forgone = max(forgone, new_value)
     least, calm_value = rank(calm[0])
     schedule, method = best
-    return _Choice(old.in_old_order(schedule), method, -least, calm_value)
+    return _Choice(old.in_old_order(schedule), method, -least, calm_value, forgone)
