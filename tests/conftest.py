@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -211,3 +212,11 @@ def play_randomly(
         actions.append(chosen)
         rewards.append(reward)
     return th.stack(actions, dim=-1), th.stack(rewards, dim=-1)
+
+
+@pytest.fixture
+def ctrl_c_works():
+    """Ctrl-C as on a terminal, here and in child processes: a suite that runs in the background may have it ignored."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)

@@ -173,6 +173,7 @@ def test_a_solver_without_a_plan(tasks_csv: Path, monkeypatch: pytest.MonkeyPatc
     assert "The solver found no plan: out of time" in capsys.readouterr().err and not Path("out").exists()
 
 
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_ctrl_c_does_not_wait_for_the_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     ended: list[Any] = []
     monkeypatch.setattr("os._exit", ended.append)

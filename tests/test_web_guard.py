@@ -236,6 +236,7 @@ def family(pid: int) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc")
+@pytest.mark.usefixtures("ctrl_c_works")
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_is_left_behind(end):
     command = [sys.executable, "-m", "sb3_uav", "serve", "--port", "0"]
