@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_uav.missions.checks import check_tasks
 from sb3_uav.missions.read import read_tasks, read_tasks_from_bytes
 from sb3_uav.missions.readers import table
-from sb3_uav.missions.readers.checks import check_tasks
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.writers.csv_tasks import tasks_to_csv, write_tasks_csv
 

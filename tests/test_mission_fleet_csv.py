@@ -6,10 +6,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from sb3_uav.missions.checks import MAX_FLEET, check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.problem import make_instance
 from sb3_uav.missions.read import read_fleet, read_fleet_from_bytes
-from sb3_uav.missions.readers.checks import MAX_FLEET, check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
 
 

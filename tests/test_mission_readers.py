@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_uav.envs import Instances
+from sb3_uav.missions.checks import MAX_TASKS, check_tasks
 from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.read import read_fleet, read_tasks, read_tasks_from_bytes
 from sb3_uav.missions.readers import instance_files
-from sb3_uav.missions.readers.checks import MAX_TASKS, check_tasks
 from sb3_uav.missions.tasks import TaskList
 
 CSV = b"id,lat,lon,value\na,47.1,8.1,2\nb,47.2,8.2,1\n"

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sb3_uav.missions.checks import check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.read import read_fleet
-from sb3_uav.missions.readers.checks import check_fits, check_fleet, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.units import parse_duration, parse_length, parse_speed
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from sb3_uav.common.files import write_atomically
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
+from sb3_uav.missions.checks import check_fleet, check_tasks
 from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.fleet import Fleet, Uav
 from sb3_uav.missions.plan import Plan
-from sb3_uav.missions.readers.checks import check_fleet, check_tasks
 from sb3_uav.missions.search import make_plan
 from sb3_uav.missions.tasks import TaskList
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from sb3_uav.envs.instances import Instances
+from sb3_uav.missions.checks import check_fits
 from sb3_uav.missions.fleet import Fleet
-from sb3_uav.missions.readers.checks import check_fits
 from sb3_uav.missions.tasks import TaskList
 
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sb3_uav.missions.checks import MAX_BYTES, check_tasks
 from sb3_uav.missions.fleet import Fleet
-from sb3_uav.missions.readers.checks import MAX_BYTES, check_tasks
 from sb3_uav.missions.readers.csv_tasks import read_csv_tasks
 from sb3_uav.missions.readers.fleet_csv import read_fleet_csv
 from sb3_uav.missions.tasks import TaskList

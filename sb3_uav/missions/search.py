@@ -11,11 +11,11 @@ import numpy as np
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, check_schedule
+from sb3_uav.missions.checks import check_fits, check_fleet, check_tasks
 from sb3_uav.missions.fleet import Fleet
 from sb3_uav.missions.leftovers import skipped_tasks
 from sb3_uav.missions.plan import Plan, Route
 from sb3_uav.missions.problem import make_instance, service_speed
-from sb3_uav.missions.readers.checks import check_fits, check_fleet, check_tasks
 from sb3_uav.missions.remarks import remarks_on
 from sb3_uav.missions.tasks import TaskList
 

@@ -8,9 +8,9 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
+from sb3_uav.missions.checks import check_tasks
 from sb3_uav.missions.fleet import Uav
 from sb3_uav.missions.plan import Plan
-from sb3_uav.missions.readers.checks import check_tasks
 from sb3_uav.missions.status import NewTask, Status, UavReport
 from sb3_uav.missions.tasks import TaskList
 

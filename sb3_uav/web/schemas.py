@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstra
 from sb3_uav.missions.flight import Firmware, Landing, Vehicle
 from sb3_uav.web.limits import MOST_TASKS, MOST_UAVS
 
-# As in sb3_uav.missions.readers.checks, so that what can be read can be sent.
+# As in sb3_uav.missions.checks, so that what can be read can be sent.
 _UNSAFE = frozenset(("Cc", "Cs", "Zl", "Zp"))
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 

@@ -196,7 +196,7 @@ def problem_of(problem: dict[str, Any]) -> tuple[TaskList, Fleet]:
 
 
 def _solve(request: dict[str, Any], blocks: list[bytes], send: Send) -> Message:
-    from sb3_uav.missions.readers.checks import check_tasks
+    from sb3_uav.missions.checks import check_tasks
     from sb3_uav.missions.search import solve
     from sb3_uav.web.plan_view import plan_parts
 

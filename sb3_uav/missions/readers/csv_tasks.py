@@ -25,8 +25,8 @@ import math
 
 import numpy as np
 
+from sb3_uav.missions.checks import MAX_TASKS, UNNAMED, check_not_degrees, check_tasks
 from sb3_uav.missions.coordinates import System
-from sb3_uav.missions.readers.checks import MAX_TASKS, UNNAMED, check_not_degrees, check_tasks
 from sb3_uav.missions.readers.columns import Cells, Column, Field, match_columns
 from sb3_uav.missions.readers.table import Table, read_table
 from sb3_uav.missions.tasks import TaskList
@@ -70,7 +70,7 @@ def read_csv_tasks(data: bytes, source: str, unit: str | None = None) -> TaskLis
     :param data: Content of the file
     :param source: Its name, for errors
     :param unit: Unit of x and y, where their names do not have one
-    :return: The tasks, which :func:`~sb3_uav.missions.readers.checks.check_tasks` has still to see
+    :return: The tasks, which :func:`~sb3_uav.missions.checks.check_tasks` has still to see
     :raises ValueError: If it is no such table; the message names row, column and what was found
     """
     known = {synonym.split("_")[0] for field in FIELDS for synonym in field.synonyms}

@@ -21,9 +21,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from sb3_uav.missions.checks import MAX_FLEET, check_fleet, check_fleet_size
 from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.fleet import Fleet, Uav
-from sb3_uav.missions.readers.checks import MAX_FLEET, check_fleet, check_fleet_size
 from sb3_uav.missions.readers.columns import Cells, Column, Field, match_columns
 from sb3_uav.missions.readers.table import read_table
 from sb3_uav.missions.units import DURATIONS, LENGTHS, SPEEDS, parse_point
@@ -55,7 +55,7 @@ def read_fleet_csv(data: bytes, source: str) -> Fleet:
     :param source: Its name, for errors
     :return: The fleet
     :raises ValueError: If it is no such table, or a UAV is not as
-        :func:`~sb3_uav.missions.readers.checks.check_fleet` demands; the message names row, column and what was found
+        :func:`~sb3_uav.missions.checks.check_fleet` demands; the message names row, column and what was found
     """
     known = {synonym.split("_")[0] for field in FIELDS for synonym in field.synonyms}
     table = read_table(data, source, sorted(known), MAX_FLEET, _EXAMPLE)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.missions.checks import UNNAMED
 from sb3_uav.missions.coordinates import System
-from sb3_uav.missions.readers.checks import UNNAMED
 from sb3_uav.missions.readers.json_file import flag_of, id_of, number_of, parse_json, shown
 from sb3_uav.missions.tasks import TaskList
 from sb3_uav.missions.writers.geojson_routes import PLANE_MEMBER

@@ -19,8 +19,8 @@ from sb3_uav.envs.instance_files import check_array_names
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.benchmarks.chao import read_chao
 from sb3_uav.evaluation.benchmarks.oplib import read_oplib
+from sb3_uav.missions.checks import MAX_TASKS, check_fleet_size
 from sb3_uav.missions.fleet import Fleet, Uav
-from sb3_uav.missions.readers.checks import MAX_TASKS, check_fleet_size
 from sb3_uav.missions.tasks import TaskList
 
 # 100,000 tasks take less than half; vrplib is slow.
