@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import multiprocessing
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,26 @@ def test_every_answer_tells_browsers_what_is_allowed(server: Served):
         assert "img-src 'self' data: https://tiles.example.org;" in policy
         assert headers["x-content-type-options"] == "nosniff"
         assert "access-control-allow-origin" not in headers
+
+
+def test_a_request_has_one_end(server: Served):
+    head = f"Host: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+    first = f"POST /login HTTP/1.1\r\n{head}Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=30) as client:
+        client.sendall(f"{first}GET {LIMITS} HTTP/1.1\r\n{head}\r\n".encode())
+        answers = b"".join(iter(lambda: client.recv(65_536), b""))
+    assert answers.startswith(b"HTTP/1.1 400") and answers.count(b"HTTP/1.1") == 1
+
+
+def test_strangers_cannot_take_the_places_of_others(server: Served):
+    assert server.ask("POST", "/login", {"token": "x" * 5000}).status == 413
+    begun = f"POST /login HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Length: 100\r\n\r\n".encode()
+    with ExitStack() as stack:
+        for _ in range(8):
+            client = stack.enter_context(socket.create_connection(("127.0.0.1", server.port)))
+            client.sendall(begun)
+        time.sleep(0.2)
+        assert server.ask("PUT", "/session", {"tasks": problem()["tasks"]}, bearer()).status == 200
 
 
 def test_paths_stay_in_the_folder(server: Served):
