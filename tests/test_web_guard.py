@@ -132,6 +132,7 @@ def test_sessions_are_kept_apart(server: Served):
 
 
 def test_sessions_keep_no_more_tasks_than_can_be_solved():
+    pytest.importorskip("httpx")
     from fastapi.testclient import TestClient
 
     from sb3_uav.web.app import Settings, create_app
