@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import multiprocessing
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -17,6 +20,7 @@ from web_server import Served, problem, served
 
 from sb3_uav.cli.main import main
 from sb3_uav.cli.serve import _checked_tiles, _checked_token
+from sb3_uav.web.limits import Limits
 from sb3_uav.web.workers import send_message
 
 for module in ("fastapi", "uvicorn", "pyproj", "numba"):
@@ -92,6 +96,26 @@ def test_every_answer_tells_browsers_what_is_allowed(server: Served):
         assert "access-control-allow-origin" not in headers
 
 
+def test_a_request_has_one_end(server: Served):
+    head = f"Host: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+    first = f"POST /login HTTP/1.1\r\n{head}Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=30) as client:
+        client.sendall(f"{first}GET {LIMITS} HTTP/1.1\r\n{head}\r\n".encode())
+        answers = b"".join(iter(lambda: client.recv(65_536), b""))
+    assert answers.startswith(b"HTTP/1.1 400") and answers.count(b"HTTP/1.1") == 1
+
+
+def test_strangers_cannot_take_the_places_of_others(server: Served):
+    assert server.ask("POST", "/login", {"token": "x" * 5000}).status == 413
+    begun = f"POST /login HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Length: 100\r\n\r\n".encode()
+    with ExitStack() as stack:
+        for _ in range(8):
+            client = stack.enter_context(socket.create_connection(("127.0.0.1", server.port)))
+            client.sendall(begun)
+        time.sleep(0.2)
+        assert server.ask("PUT", "/session", {"tasks": problem()["tasks"]}, bearer()).status == 200
+
+
 def test_paths_stay_in_the_folder(server: Served):
     for path in ("/static/../app.py", "/static/%2e%2e/app.py", "/static/..%2fapp.py", "/static//etc/passwd"):
         assert server.ask("GET", path, headers=bearer()).status == 404
@@ -105,6 +129,44 @@ def test_sessions_are_kept_apart(server: Served):
     assert mine.json["form"] == {"count": "7"} and len(mine.json["tasks"]["tasks"]) == 12
     assert server.ask("GET", "/session", headers=bearer()).json is None
     assert server.ask("PUT", "/session", {**draft, "form": {"a": "x" * 201}}, bearer()).status == 422
+
+
+def test_sessions_keep_no_more_tasks_than_can_be_solved():
+    pytest.importorskip("httpx")
+    from fastapi.testclient import TestClient
+
+    from sb3_uav.web.app import Settings, create_app
+
+    client = TestClient(create_app(Settings(Limits(max_tasks=11))), base_url="http://127.0.0.1")
+    answer = client.put("/session", json={"tasks": problem()["tasks"]})
+    assert answer.status_code == 422 and "admits 11 tasks" in answer.json()["detail"]
+    assert client.put("/session", json={"tasks": problem(11)["tasks"]}).status_code == 200
+
+
+@pytest.mark.parametrize("text", [b"no JSON", b"[]", b'{"blocks": 0}'])
+def test_a_worker_that_sends_nonsense_is_replaced(text):
+    from sb3_uav.web.jobs import Job, Pool
+
+    ours, theirs = multiprocessing.Pipe()
+    process = SimpleNamespace(join=lambda _: None, exitcode=None, sentinel=theirs)
+    job = Job({"kind": "solve"}, [], 10.0)
+    with ours, theirs:
+        theirs.send_bytes(text)
+        worker = SimpleNamespace(connection=ours, waitable=[ours], process=process)
+        assert not Pool(1, 1, 1, "solves")._run(worker, job)
+    assert job.state == "failed" and "ended unexpectedly" in job.error
+
+
+def test_a_killed_fork_server_ends_no_thread(monkeypatch):
+    from sb3_uav.web import jobs
+
+    def killed() -> None:
+        raise EOFError("unexpected EOF")
+
+    monkeypatch.setattr(jobs, "Worker", killed)
+    pool = jobs.Pool(1, 1, 1, "solves")
+    pool._pause = 0.0
+    assert pool._start(0) is None and "cannot be started" in pool.start_error
 
 
 def test_oldest_sessions_are_dropped():

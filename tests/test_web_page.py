@@ -188,6 +188,30 @@ def test_a_second_browser_waits_in_the_queue(server: Served, browser: Any):
         second.page.wait_for_selector("#state[data-state=canceled]")
 
 
+@pytest.mark.slow
+def test_a_solve_that_is_left_ends(server: Served, browser: Any):
+    assert server.rooms is not None
+    with visit_in(browser) as visit:
+        page = opened(visit, server)
+        blocking = server.solve(n_tasks=40, time_limit=60.0)
+        server.wait(blocking, "running")
+        drop(page, "field.csv", FIELD)
+        page.get_by_text("24 tasks").wait_for()
+        page.fill("#time", "60")
+        page.click("#solve")
+        page.wait_for_selector("#state[data-state=waiting]")
+        # There is no plan yet, but what comes will be one of the old tasks.
+        page.fill("#count", "7")
+        page.locator("#count").blur()
+        page.wait_for_selector("#stale:not([hidden])", state="attached", timeout=5000)
+        with page.expect_response(lambda answer: answer.request.method == "DELETE", timeout=5000) as left:
+            drop(page, "field.csv", FIELD)
+        assert left.value.json()["state"] == "canceled" and server.rooms.solves.n_waiting == 0
+        server.ask("DELETE", f"/api/v1/solves/{blocking}")
+        seconds = "import('/static/tools.js').then(({ minutes }) => [59.7, 119.6, 61].map(minutes))"
+        assert page.evaluate(seconds) == ["1 min 0 s", "2 min 0 s", "1 min 1 s"]
+
+
 def test_errors_are_sentences(server: Served, browser: Any):
     with visit_in(browser, allowed=(REFUSED,)) as visit:
         page = opened(visit, server)

@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sb3-uav serve: http://{shown}:{port} (Ctrl-C ends it)", flush=True)
         config = uvicorn.Config(
             app,
+            # It bounds what headers may take; httptools, which uvicorn prefers where it is installed, does not.
+            http="h11",
             log_level="warning",
             access_log=False,
             server_header=False,

@@ -91,7 +91,7 @@ def create_app(settings: Settings | None = None) -> Any:
     )
     app.state.rooms, app.state.sessions = rooms, sessions
     app.include_router(api_router(rooms))
-    _add_page(app, keys, sessions)
+    _add_page(app, keys, sessions, settings.limits.max_tasks)
     _add_errors(app)
     _name_errors(app)
     return Guarded(
@@ -122,7 +122,7 @@ class Guarded:
         await self._guard(scope, receive, send)
 
 
-def _add_page(app: FastAPI, keys: Keys, sessions: Sessions) -> None:
+def _add_page(app: FastAPI, keys: Keys, sessions: Sessions, max_tasks: int) -> None:
     failures = asyncio.Semaphore(2)
 
     @app.get("/", include_in_schema=False)
@@ -152,6 +152,9 @@ def _add_page(app: FastAPI, keys: Keys, sessions: Sessions) -> None:
 
     @app.put("/session", include_in_schema=False)
     def save(draft: Draft, request: Request, response: Response) -> dict[str, bool]:
+        # What cannot be solved is not kept either: sessions stay in memory.
+        if len(draft.tasks.tasks) > max_tasks:
+            raise HTTPException(422, f"This server admits {max_tasks} tasks at most.")
         given = session_of(request)
         name = sessions.save(given, draft.model_dump_json().encode())
         if name != given:

@@ -29,6 +29,9 @@ _OPEN_PATHS = ("/login", "/static/")
 _SECONDS_PER_BLOCK = 20.0
 _SECONDS_PER_BODY = 120.0
 _SECONDS_OF_LINGERING = 5.0
+# Bodies of those who have not shown the token yet: a token has 500 characters at most.
+_MOST_LOGIN_BYTES = 4096
+_MOST_LOGINS = 8
 
 
 class Keys:
@@ -91,7 +94,8 @@ class Guard:
     ) -> None:
         self._app, self._keys, self._max_body_bytes = app, keys, max_body_bytes
         self._names = {name.lower() for name in names}
-        self._bodies = asyncio.Semaphore(max_bodies)
+        # Apart, so that clients without the token cannot take the places of those with it.
+        self._bodies, self._logins = asyncio.Semaphore(max_bodies), asyncio.Semaphore(_MOST_LOGINS)
         images = f"'self' data: {tiles}" if tiles else "'self' data:"
         policy = (
             f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {images}; connect-src 'self'; "
@@ -163,19 +167,26 @@ class Guard:
 
     async def _with_body(self, scope: Scope, headers: dict[str, str], receive: Receive, send: SendFunction) -> None:
         """Read a body of limited size, and pass it on."""
+        if "content-length" in headers and "transfer-encoding" in headers:
+            # A proxy may see another end of this request (https://datatracker.ietf.org/doc/html/rfc9112#section-6.3).
+            await _answer(send, 400, "Send either Content-Length or Transfer-Encoding, not both.", _CLOSE)
+            return
+        is_admitted = self._keys.admits(headers)
+        places, most = (self._bodies, self._max_body_bytes) if is_admitted else (self._logins, _MOST_LOGIN_BYTES)
+        most = min(most, self._max_body_bytes)
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or int(length[:20]) > self._max_body_bytes:
-            await self._refuse_body(receive, send)
+        if not length.isdecimal() or int(length[:20]) > most:
+            await self._refuse_body(receive, send, most)
             return
         try:
-            await asyncio.wait_for(self._bodies.acquire(), _SECONDS_PER_BLOCK)
+            await asyncio.wait_for(places.acquire(), _SECONDS_PER_BLOCK)
         except asyncio.TimeoutError:
             await _answer(send, 503, "Too many files are being sent at this moment; try again in a minute.", _CLOSE)
             return
         try:
-            body = await asyncio.wait_for(self._read(receive), _SECONDS_PER_BODY)
+            body = await asyncio.wait_for(self._read(receive, most), _SECONDS_PER_BODY)
             if body is None:
-                await self._refuse_body(receive, send)
+                await self._refuse_body(receive, send, most)
                 return
             messages = [{"type": "http.request", "body": body, "more_body": False}]
             del body
@@ -189,9 +200,9 @@ class Guard:
         except _GoneError:
             return
         finally:
-            self._bodies.release()
+            places.release()
 
-    async def _read(self, receive: Receive) -> bytes | None:
+    async def _read(self, receive: Receive, most: int) -> bytes | None:
         """:return: The body; None as soon as it is too large"""
         body = bytearray()
         while True:
@@ -199,17 +210,17 @@ class Guard:
             if message["type"] == "http.disconnect":
                 raise _GoneError
             body += message.get("body", b"")
-            if len(body) > self._max_body_bytes:
+            if len(body) > most:
                 return None
             if not message.get("more_body", False):
                 return bytes(body)
 
-    async def _refuse_body(self, receive: Receive, send: SendFunction) -> None:
+    async def _refuse_body(self, receive: Receive, send: SendFunction, most: int) -> None:
         """
         Say that a body is too large, and throw away what still comes in for a moment: a connection that is closed while a
         client sends is reset, and then the client never sees the sentence.
         """
-        sentence = f"A request may have {self._max_body_bytes / 2**20:g} MiB at most."
+        sentence = f"A request may have {most / 2**20:g} MiB at most."
         await _answer(send, 413, sentence, _CLOSE, is_last=False)
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(_drain(receive), _SECONDS_OF_LINGERING)

@@ -17,6 +17,8 @@ State = Literal["waiting", "running", "done", "failed", "canceled"]
 PARTS = ("mission", "report", "geojson")
 _MOST_POINTS = 500
 _TICK = 0.2
+# A worker that is gone, or whose message is none: nothing of this may end the thread that looks after a worker.
+_UNREADABLE = (EOFError, OSError, ValueError, KeyError, TypeError, MemoryError)
 
 
 class BusyError(Exception):
@@ -191,7 +193,8 @@ class Pool:
     def _start(self, slot: int) -> Worker | None:
         try:
             worker = self.workers[slot] = Worker()
-        except OSError as error:
+        except (EOFError, OSError) as error:
+            # EOFError: the process that workers are forked from has just been killed; the next try starts it again.
             self.start_error = f"A worker cannot be started ({error})."
             self._wait_longer()
             return None
@@ -200,7 +203,7 @@ class Pool:
             if worker.connection in ready:
                 try:
                     message, _ = receive_message(worker.connection)
-                except (EOFError, OSError):
+                except _UNREADABLE:
                     break
                 if message["event"] != "ready":
                     self.start_error = message["error"]
@@ -251,7 +254,7 @@ class Pool:
                         return True
                 elif ready:
                     break
-        except (EOFError, OSError):
+        except _UNREADABLE:
             pass
         worker.process.join(1.0)
         code = worker.process.exitcode

@@ -3,7 +3,7 @@
 import { exampleTasks, field, fleet } from "./forms.js";
 import { MissionMap } from "./map.js";
 import { showDetails, uavRows } from "./panels.js";
-import { showProgress } from "./progress.js";
+import { isUnderway, leave, showProgress } from "./progress.js";
 import { showResult } from "./results.js";
 import { Tiles } from "./tiles.js";
 import { $, ask, element, refuse } from "./tools.js";
@@ -92,7 +92,8 @@ async function load() {
 
 // A change of tasks or fleet.
 function changed() {
-  state.stale = state.report !== null;
+  // A solve that has no plan yet works on the old tasks, too.
+  state.stale = state.report !== null || isUnderway(state.progress);
   show();
   save();
 }
@@ -128,7 +129,7 @@ function show() {
   $("individual").hidden = state.uavs === null;
   $("split").textContent = state.uavs ? "Use equal UAVs" : "Set each UAV by itself";
   uavRows($("uavs"), state.uavs ?? [], changed);
-  const waits = state.progress && ["waiting", "running"].includes(state.progress.state);
+  const waits = isUnderway(state.progress);
   $("solve").hidden = waits;
   $("cancel").hidden = !waits;
   $("solve").disabled = !list.length;
@@ -237,6 +238,7 @@ async function takeFile(file) {
     tasks.tasks.forEach((task) => {
       task.forbidden = false;
     });
+    leave(state.progress);
     Object.assign(state, {
       tasks,
       uavs: uavs ?? state.uavs,
@@ -312,7 +314,7 @@ async function follow() {
       }
       if (progress.version !== seen) show();
       seen = progress.version;
-      if (!["waiting", "running"].includes(progress.state)) return;
+      if (!isUnderway(progress)) return;
     } catch (error) {
       if (error.status === 404) {
         Object.assign(state, { solve: null, progress: null, report: null });
@@ -333,6 +335,7 @@ async function follow() {
 const pause = (time) => new Promise((done) => setTimeout(done, time));
 
 function example() {
+  leave(state.progress);
   Object.assign(state, {
     tasks: exampleTasks(),
     solve: null,
@@ -346,6 +349,7 @@ function example() {
 }
 
 function clear() {
+  leave(state.progress);
   Object.assign(state, {
     tasks: emptyTasks(),
     uavs: null,

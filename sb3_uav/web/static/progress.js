@@ -1,5 +1,12 @@
 // How far a solve is.
-import { $, number, refuse } from "./tools.js";
+import { $, ask, number, refuse } from "./tools.js";
+
+export const isUnderway = (progress) => ["waiting", "running"].includes(progress?.state);
+
+// Stop a solve that nobody looks at any more: the next one would wait for it.
+export function leave(progress) {
+  if (isUnderway(progress)) ask("DELETE", `/api/v1/solves/${encodeURIComponent(progress.id)}`).catch(() => {});
+}
 
 // Bar, curve and sentence of a solve.
 export function showProgress(progress) {

@@ -32,5 +32,8 @@ document.querySelector("#error button")?.addEventListener("click", () => refuse(
 
 export const number = (value) => Number(value.toPrecision(6)).toLocaleString("en-US", { maximumFractionDigits: 2 });
 export const kilometers = (meters) => (meters >= 1000 ? `${(meters / 1000).toFixed(2)} km` : `${meters.toFixed(0)} m`);
-export const minutes = (seconds) =>
-  seconds >= 60 ? `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s` : `${seconds.toFixed(0)} s`;
+export const minutes = (seconds) => {
+  // Rounded before it is divided, else there would be 60 s.
+  const whole = Math.round(seconds);
+  return whole >= 60 ? `${Math.floor(whole / 60)} min ${whole % 60} s` : `${whole} s`;
+};
