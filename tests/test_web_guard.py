@@ -12,6 +12,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -152,9 +153,9 @@ def test_a_worker_that_sends_nonsense_is_replaced(text):
     job = Job({"kind": "solve"}, [], 10.0)
     with ours, theirs:
         theirs.send_bytes(text)
-        worker = SimpleNamespace(connection=ours, waitable=[ours], process=process)
+        worker: Any = SimpleNamespace(connection=ours, waitable=[ours], process=process)
         assert not Pool(1, 1, 1, "solves")._run(worker, job)
-    assert job.state == "failed" and "ended unexpectedly" in job.error
+    assert job.state == "failed" and "ended unexpectedly" in str(job.error)
 
 
 def test_a_killed_fork_server_ends_no_thread(monkeypatch):
@@ -166,7 +167,7 @@ def test_a_killed_fork_server_ends_no_thread(monkeypatch):
     monkeypatch.setattr(jobs, "Worker", killed)
     pool = jobs.Pool(1, 1, 1, "solves")
     pool._pause = 0.0
-    assert pool._start(0) is None and "cannot be started" in pool.start_error
+    assert pool._start(0) is None and "cannot be started" in str(pool.start_error)
 
 
 def test_oldest_sessions_are_dropped():

@@ -173,8 +173,11 @@ def test_a_second_browser_waits_in_the_queue(server: Served, browser: Any):
         for visit in (first, second):
             opened(visit, server).get_by_text("Load an example").click()
             visit.page.fill("#time", "60")
-        first.page.click("#solve")
+        asked: list[str] = []
+        first.page.on("request", lambda request: asked.append(request.url) if request.method == "POST" else None)
+        first.page.dblclick("#solve")
         first.page.locator("#state", has_text="getting better").wait_for()
+        assert sum(url.endswith("/solves") for url in asked) == 1
         second.page.click("#solve")
         second.page.locator("#state", has_text="next in the queue").wait_for()
         # A reload while it runs: the page goes on where it was.

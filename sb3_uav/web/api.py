@@ -111,7 +111,12 @@ class Rooms:
             self.desk.submit(job)
         except BusyError as error:
             raise HTTPException(429, str(error)) from error
-        await anyio.to_thread.run_sync(job.over.wait, self.limits.desk_seconds * 3 + 120, abandon_on_cancel=True)
+        try:
+            await anyio.to_thread.run_sync(job.over.wait, self.limits.desk_seconds * 3 + 120, abandon_on_cancel=True)
+        finally:
+            # Nobody asks for the result of a job that was given up.
+            if not job.over.is_set():
+                self.desk.cancel(job)
         if job.state != "done":
             raise HTTPException(422, job.error or "This took too long and was stopped.")
         return job.parts[0]

@@ -277,6 +277,8 @@ async function takeFleet(file) {
 
 async function solve() {
   refuse(null);
+  // A double click is one solve.
+  $("solve").disabled = true;
   $("state").dataset.state = "sent";
   try {
     const options = {
@@ -294,6 +296,8 @@ async function solve() {
     follow();
   } catch (error) {
     refuse(error);
+  } finally {
+    $("solve").disabled = !state.tasks.tasks.length;
   }
 }
 
