@@ -22,15 +22,12 @@ PLAN_FILE = "mission.json"
 _VERSION = 1
 
 
-def plan_to_json(plan: Plan) -> dict[str, Any]:
+def tasks_to_json(tasks: TaskList) -> dict[str, Any]:
     """
-    :param plan: A plan
-    :return: Plain data
+    :param tasks: Tasks, with or without a depot
+    :return: Plain data, without their fleet
     """
-    tasks = plan.tasks
     return {
-        "format": "sb3-uav mission",
-        "version": _VERSION,
         "system": tasks.system,
         "meters_per_unit": tasks.meters_per_unit,
         "depot": None if tasks.depot is None else tasks.depot.tolist(),
@@ -46,6 +43,18 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
             }
             for task in range(len(tasks))
         ],
+    }
+
+
+def plan_to_json(plan: Plan) -> dict[str, Any]:
+    """
+    :param plan: A plan
+    :return: Plain data
+    """
+    return {
+        "format": "sb3-uav mission",
+        "version": _VERSION,
+        **tasks_to_json(plan.tasks),
         "fleet": [
             {
                 "id": uav.id,
@@ -59,7 +68,7 @@ def plan_to_json(plan: Plan) -> dict[str, Any]:
             }
             for uav in plan.fleet
         ],
-        "routes": [[tasks.ids[task] for task in route.stops] for route in plan.routes],
+        "routes": [[plan.tasks.ids[task] for task in route.stops] for route in plan.routes],
         "solver": plan.solver,
         "seed": plan.seed,
         "seconds": plan.seconds,

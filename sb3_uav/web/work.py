@@ -129,25 +129,10 @@ def _known(data: Any, model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _tasks_to_json(tasks: TaskList) -> dict[str, Any]:
-    return {
-        "system": tasks.system,
-        "meters_per_unit": tasks.meters_per_unit,
-        "depot": None if tasks.depot is None else tasks.depot.tolist(),
-        "source": tasks.source,
-        "tasks": [
-            {
-                "id": tasks.ids[task],
-                "point": tasks.points[task].tolist(),
-                "value": float(tasks.values[task]),
-                "service_s": float(tasks.service_s[task]),
-                "must": bool(tasks.must[task]),
-                "altitude_m": None if np.isnan(tasks.altitudes[task]) else float(tasks.altitudes[task]),
-            }
-            for task in range(len(tasks))
-        ],
-        "notes": list(tasks.notes),
-        "uavs": None if tasks.fleet is None else [_uav_to_json(uav) for uav in tasks.fleet],
-    }
+    from sb3_uav.missions.plan_file import tasks_to_json
+
+    uavs = None if tasks.fleet is None else [_uav_to_json(uav) for uav in tasks.fleet]
+    return {**tasks_to_json(tasks), "notes": list(tasks.notes), "uavs": uavs}
 
 
 def _uav_to_json(uav: Uav) -> dict[str, Any]:
