@@ -23,7 +23,7 @@ class TaskList:
     :param service_s: ``(n,)``, seconds that a UAV stays at every task
     :param must: ``(n,)`` bool, tasks that come first
     :param depot: ``(2,)``, where the UAVs start and land; None if the file does not say
-    :param altitudes: ``(n,)``, meters above the depot at which a task wants to be served; NaN where it does not matter
+    :param altitudes: ``(n,)``, meters above the depot at which a task is to be served; NaN where it does not matter
     :param meters_per_unit: Length of one unit of the plane
     :param fleet: The UAVs, if the file says which there are
     :param places: Where in the file every task stands, such as ``"row 7"``, for messages

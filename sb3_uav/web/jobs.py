@@ -31,7 +31,7 @@ class Job:
     :param request: Plain data for :func:`~sb3_uav.web.work.do`
     :param blocks: Bytes that go with it; dropped when the job has ended
     :param seconds: After this time in a worker, the worker is stopped
-    :param about: What the server wants to remember about it
+    :param about: What the server keeps with it
     """
 
     request: dict[str, Any]

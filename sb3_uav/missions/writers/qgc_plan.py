@@ -21,7 +21,7 @@ from sb3_uav.missions.writers.names import file_stems
 #: MAV_AUTOPILOT and MAV_TYPE of https://mavlink.io/en/messages/common.html
 FIRMWARE_TYPES: dict[Firmware, int] = {"px4": 12, "ardupilot": 3}
 VEHICLE_TYPES: dict[Vehicle, int] = {"multirotor": 2, "fixed-wing": 1}
-# What QGroundControl proposes for vehicles of which it knows no better, in meters per second.
+# What QGroundControl proposes where nothing is said, in meters per second.
 _CRUISE_SPEED, _HOVER_SPEED = 15.0, 5.0
 _RELATIVE_ALTITUDES = 1
 
