@@ -53,5 +53,24 @@ def test_workflow_covers_all_pythons_and_the_ends_of_the_version_ranges():
     classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "setup.cfg").read_text(encoding="utf-8"))
     assert re.findall(r'"(3\.\d+)"', re.findall(r"python-version: \[(.*)\]", workflow)[0]) == classifiers
     assert "CONSTRAINTS=constraints-oldest.txt" in workflow and "CONSTRAINTS= " in workflow
-    # Actions by hash: a tag can be moved.
-    assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", use) for use in re.findall(r"uses: (\S+)", workflow))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.name)
+def test_actions_are_named_by_hash(path):
+    """A tag can be moved."""
+    uses = re.findall(r"uses: (\S+)", path.read_text(encoding="utf-8"))
+    assert uses and all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", use) for use in uses)
+
+
+def test_the_version_is_the_same_everywhere():
+    version = (ROOT / "sb3_uav" / "version.txt").read_text(encoding="utf-8").strip()
+    (cited,) = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    newest = re.findall(r"^## Release (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[0]
+    assert version == cited == newest
+
+
+def test_publishing_builds_once_and_tries_the_wheel_on_every_python():
+    workflow = (ROOT / ".github" / "workflows" / "publish.yml").read_text(encoding="utf-8")
+    classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "setup.cfg").read_text(encoding="utf-8"))
+    assert re.findall(r'"(3\.\d+)"', re.findall(r"python-version: \[(.*)\]", workflow)[0]) == classifiers
+    assert workflow.count("-m build\n") == 1 and "needs: try" in workflow and "id-token: write" in workflow

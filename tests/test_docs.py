@@ -16,6 +16,8 @@ DOCUMENTS = sorted(
 )
 PNGS, PDFS = sorted(DOCS.rglob("*.png")), sorted(DOCS.rglob("*.pdf"))
 # [text](target), ![text](target "title") and [name]: target
+(REPOSITORY,) = re.findall(r"^url = (\S+)$", (ROOT / "setup.cfg").read_text(encoding="utf-8"), flags=re.MULTILINE)
+OURS = re.compile(rf"(?:{REPOSITORY}/(?:blob|tree)|{REPOSITORY.replace('github', 'raw.githubusercontent')})/main/")
 LINK = re.compile(r"\]\(\s*<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\s*\)|^\[[^\]]+\]:\s*(\S+)", re.MULTILINE)
 
 
@@ -82,8 +84,10 @@ def links() -> list[tuple[Path, str]]:
     for document in DOCUMENTS:
         for match in LINK.finditer(without_code(document.read_text(encoding="utf-8"))):
             target = match.group(1) or match.group(2)
-            if not re.match(r"[a-z]+:", target):
-                pairs.append((document, target))
+            # Absolute links into this repository, such as the README has, lead to the same files.
+            path = OURS.sub(f"{Path('../' * (len(document.relative_to(ROOT).parts) - 1)).as_posix()}/", target)
+            if not re.match(r"[a-z]+:", path):
+                pairs.append((document, path))
     return pairs
 
 
@@ -94,3 +98,22 @@ def test_links_lead_somewhere(document: Path, target: str) -> None:
     path = (document.parent / unquote(name)).resolve() if name else document
     assert path.is_relative_to(ROOT) and path.exists(), f"{relative(document)}: {target}"
     assert not anchor or anchor in anchors(path), f"{relative(document)}: {target}; there are {sorted(anchors(path))}"
+
+
+def test_the_readme_has_absolute_links_only() -> None:
+    """Package indexes show it too, and resolve no others."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    targets = [match.group(1) or match.group(2) for match in LINK.finditer(without_code(readme))]
+    assert len([target for target in targets if OURS.match(target)]) > 15
+    assert [target for target in targets if not target.startswith("https://")] == []
+    # Pictures come from where files are served as they are.
+    assert all("raw.githubusercontent.com" in target for target in re.findall(r"!\[[^\]]*\]\((\S+)\)", readme))
+
+
+def test_every_file_names_the_same_repository() -> None:
+    pages = [*DOCUMENTS, ROOT / "CITATION.cff", ROOT / "setup.cfg", *(ROOT / ".github").rglob("*.yml")]
+    for path in pages:
+        for found in re.findall(
+            r"https://(?:raw\.githubusercontent|github)\.com/([\w-]+/sb3[_-]uav)\b", path.read_text(encoding="utf-8")
+        ):
+            assert REPOSITORY.endswith(f"/{found}"), relative(path)
