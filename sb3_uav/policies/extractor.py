@@ -50,6 +50,13 @@ class Cache:
         """
         return self._map(lambda field: field[rows])
 
+    def followed_by(self: CacheT, *others: CacheT) -> CacheT:
+        """
+        :param others: Encodings of further instances by the same network
+        :return: The encodings of all, one after the other
+        """
+        return self._map(lambda *parts: th.cat(parts), *others)
+
     def update_rows(self: CacheT, rows: th.Tensor, fresh: CacheT) -> CacheT:
         """
         :param rows: ``(n,)`` int64

@@ -11,7 +11,7 @@ from sb3_uav.policies import EpisodicPolicy, MaskedAttentionPolicy
 from sb3_uav.reinforce.recognition import why_unrecognized
 
 # Settings of REINFORCE that only one of the drivers uses, with their defaults.
-_FUSED_SETTINGS: dict[str, Any] = {"n_samples": 1, "instances_per_epoch": 1_280_000, "lr_decay": 1.0}
+_FUSED_SETTINGS: dict[str, Any] = {"n_samples": 1, "instances_per_epoch": 1_280_000, "lr_decay": 1.0, "micro_batch_size": None}
 _STEP_LOOP_SETTINGS: dict[str, Any] = {"n_steps": 512, "gamma": 1.0}
 
 

@@ -18,17 +18,36 @@ class EpisodeBatch(NamedTuple):
     Complete episodes on which the next update is computed.
 
     :param instances: ``batch`` instances
-    :param cache: The encodings of the instances, with gradients
+    :param cache: The encodings of the instances, with gradients; None if each micro-batch is to be encoded by itself
     :param actions: ``(batch, n_samples, n_steps)`` int64
     :param returns: ``(batch, n_samples)`` float64
     :param baseline: Baseline values, float64, broadcastable against ``returns``
+    :param micro_batch_size: Number of instances whose gradients are computed at once; all when None
     """
 
     instances: Instances
-    cache: Cache
+    cache: Cache | None
     actions: th.Tensor
     returns: th.Tensor
     baseline: th.Tensor
+    micro_batch_size: int | None = None
+
+    def micro_batches(self) -> list[EpisodeBatch]:
+        """:return: The parts whose gradients are computed one after the other; the batch itself if there is one"""
+        size = self.micro_batch_size
+        if size is None or size >= len(self.instances):
+            return [self]
+        baseline = self.baseline.expand(len(self.instances), -1)
+        return [
+            EpisodeBatch(
+                self.instances[rows],
+                None if self.cache is None else self.cache.rows(rows),
+                self.actions[rows],
+                self.returns[rows],
+                baseline[rows],
+            )
+            for rows in th.arange(len(self.instances), device=self.actions.device).split(size)
+        ]
 
     def rewards_to_go(self, problem: Problem) -> th.Tensor:
         """

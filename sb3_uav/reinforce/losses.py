@@ -2,47 +2,97 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
-from stable_baselines3.common.utils import explained_variance
 
+from sb3_uav.policies.base import EpisodeEvaluation
 from sb3_uav.reinforce.advantages import BY_INSTANCE, scale_advantages, scale_by_instance
 from sb3_uav.reinforce.episode_batch import EpisodeBatch
 
 
-def episode_loss(model: Any, batch: EpisodeBatch) -> th.Tensor:
+class LossParts(NamedTuple):
+    """
+    A loss and what it is made of, all scalars.
+
+    :param loss: What is minimized
+    :param policy: The policy gradient's part
+    :param entropy: Mean entropy
+    :param value: The critic's part; None without a critic
+    """
+
+    loss: th.Tensor
+    policy: th.Tensor
+    entropy: th.Tensor
+    value: th.Tensor | None
+
+    def detach(self) -> LossParts:
+        """:return: The same without gradients"""
+        value = None if self.value is None else self.value.detach()
+        return LossParts(self.loss.detach(), self.policy.detach(), self.entropy.detach(), value)
+
+    def plus(self, other: LossParts) -> LossParts:
+        """
+        :param other: The parts of another micro-batch
+        :return: The sums
+        """
+        value = None if self.value is None or other.value is None else self.value + other.value
+        return LossParts(self.loss + other.loss, self.policy + other.policy, self.entropy + other.entropy, value)
+
+
+def real_steps(model: Any, batch: EpisodeBatch) -> th.Tensor:
+    """
+    :param model: A REINFORCE algorithm
+    :param batch: The episodes
+    :return: ``(batch, n_samples, n_steps)`` bool, False after the end of an episode, where actions are padding
+    """
+    lengths = model.problem.lengths(batch.instances, batch.actions)
+    return th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
+
+
+def episode_advantages(model: Any, batch: EpisodeBatch, values: th.Tensor | None) -> th.Tensor:
+    """
+    :param model: A REINFORCE algorithm
+    :param batch: All episodes of the update
+    :param values: ``(batch, n_samples, n_steps)``, the critic's estimates; None without a critic
+    :return: The advantage of every episode, ``(batch, n_samples, 1)``; with a critic of every step, ``(batch, n_samples,
+        n_steps)``, 0 after the end of an episode
+    """
+    if values is None:
+        return _normalized(model, (batch.returns - batch.baseline).float())[..., None]
+    real = real_steps(model, batch)
+    advantages = th.zeros_like(values)
+    advantages[real] = _normalized(model, batch.rewards_to_go(model.problem)[real] - values[real])
+    return advantages
+
+
+def episode_loss(
+    model: Any, batch: EpisodeBatch, evaluation: EpisodeEvaluation, advantages: th.Tensor, whole: EpisodeBatch
+) -> LossParts:
     """
     mean((baseline - return) * sum of log-probabilities) (paper, equation (24)).
 
-    :param model: A REINFORCE algorithm, whose logger gets the parts of the loss
-    :param batch: The episodes
-    :return: The loss, a scalar
+    :param model: A REINFORCE algorithm
+    :param batch: Some of the episodes of the update, or all
+    :param evaluation: The policy's view of them, with gradients
+    :param advantages: Their part of :func:`episode_advantages`
+    :param whole: All episodes of the update
+    :return: What these episodes contribute to the loss of all of them
     """
-    evaluation = model.policy.evaluate_episodes(batch.instances, batch.actions, batch.cache)
+    share = len(batch.instances) / len(whole.instances)
+    policy_loss = -(advantages * evaluation.log_prob).sum(-1).mean() * share
     value_loss = None
     if model.baseline == "critic":
-        # Actions after the end of an episode are padding.
-        lengths = model.problem.lengths(batch.instances, batch.actions)
-        real = th.arange(batch.actions.shape[-1], device=lengths.device) < lengths[..., None]
-        to_go, values = batch.rewards_to_go(model.problem)[real], evaluation.values[real]
-        value_loss = ((to_go - values) ** 2).mean()
-        variance = explained_variance(values.detach().cpu().numpy(), to_go.cpu().numpy())
-        model.logger.record("train/explained_variance", float(variance))
-        weighted = th.zeros_like(evaluation.log_prob)
-        weighted[real] = _normalized(model, to_go - values.detach()) * evaluation.log_prob[real]
-    else:
-        model.logger.record("train/baseline", batch.baseline.mean().item())
-        advantages = _normalized(model, (batch.returns - batch.baseline).float())
-        weighted = advantages[..., None] * evaluation.log_prob
-    policy_loss = -weighted.sum(-1).mean()
-    return _total_loss(model, policy_loss, evaluation.entropy.sum(-1).mean(), value_loss)
+        real = real_steps(model, batch)
+        errors = batch.rewards_to_go(model.problem)[real] - evaluation.values[real]
+        value_loss = (errors**2).sum() / real_steps(model, whole).sum()
+    return _parts(model, policy_loss, evaluation.entropy.sum(-1).mean() * share, value_loss)
 
 
-def step_loss(model: Any) -> th.Tensor:
+def step_loss(model: Any) -> LossParts:
     """
     :param model: A REINFORCE algorithm, whose rollout buffer holds the steps
-    :return: The loss, a scalar
+    :return: The loss
     """
     data = next(model.rollout_buffer.get(batch_size=None))
     # Of sb3-contrib's buffers; the policies of this package find masks in the observations.
@@ -52,7 +102,7 @@ def step_loss(model: Any) -> th.Tensor:
     if model.baseline == "critic":
         value_loss = ((data.returns - values.flatten()) ** 2).mean()
     mean_entropy = -log_prob.mean() if entropy is None else entropy.mean()
-    return _total_loss(model, -(data.advantages * log_prob).mean(), mean_entropy, value_loss)
+    return _parts(model, -(data.advantages * log_prob).mean(), mean_entropy, value_loss)
 
 
 def _normalized(model: Any, advantages: th.Tensor) -> th.Tensor:
@@ -62,11 +112,10 @@ def _normalized(model: Any, advantages: th.Tensor) -> th.Tensor:
     return scale_advantages(advantages) if model.normalize_advantage else advantages
 
 
+def _parts(model: Any, policy_loss: th.Tensor, entropy: th.Tensor, value_loss: th.Tensor | None) -> LossParts:
+    return LossParts(_total_loss(model, policy_loss, entropy, value_loss), policy_loss, entropy, value_loss)
+
+
 def _total_loss(model: Any, policy_loss: th.Tensor, entropy: th.Tensor, value_loss: th.Tensor | None) -> th.Tensor:
-    model.logger.record("train/policy_gradient_loss", policy_loss.item())
-    model.logger.record("train/entropy_loss", -entropy.item())
     loss = policy_loss - model.ent_coef * entropy
-    if value_loss is not None:
-        model.logger.record("train/value_loss", value_loss.item())
-        loss = loss + model.vf_coef * value_loss
-    return loss
+    return loss if value_loss is None else loss + model.vf_coef * value_loss

@@ -36,8 +36,9 @@ from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
 from sb3_uav.reinforce.finite import require_finite
-from sb3_uav.reinforce.losses import episode_loss, step_loss
+from sb3_uav.reinforce.gradients import accumulate_gradients
 from sb3_uav.reinforce.masked_steps import MaskedStepLoop
+from sb3_uav.reinforce.micro_batches import MicroBatches, encode_in_parts
 from sb3_uav.reinforce.monitor_rows import log_episodes
 from sb3_uav.reinforce.recognition import find_problem
 
@@ -48,6 +49,8 @@ NO_STEP_LIMIT = 2**62
 # Settings of SB3's on-policy algorithms that REINFORCE does not offer: returns are not mixed with value estimates, and actions
 # are discrete.
 _NOT_OFFERED: dict[str, Any] = dict(gae_lambda=1.0, use_sde=False, sde_sample_freq=-1)
+
+_NOT_SAVED = ("_baseline", "baseline_policy", "_batch", "max_instances", "_micro_batches")
 
 
 class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
@@ -81,6 +84,9 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
     :param normalize_advantage: Whether to divide advantages by their standard deviation (SB3's loop, like SB3's A2C, also
         subtracts their mean); ``"instance"`` divides those of each instance by their own (fused driver), for instances whose
         returns differ much
+    :param micro_batch_size: Number of instances whose gradients are computed at once (fused driver); the update is the same,
+        but for rounding, with less memory. When None all of a batch, or as many as fit into memory, see
+        :mod:`sb3_uav.reinforce.micro_batches`
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation
@@ -118,6 +124,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         vf_coef: float = 0.5,
         max_grad_norm: float = 1.0,
         normalize_advantage: bool | str = False,
+        micro_batch_size: int | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -153,6 +160,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         if isinstance(normalize_advantage, str) and normalize_advantage != BY_INSTANCE:
             raise ValueError(f"normalize_advantage is {normalize_advantage!r}; give True, False or {BY_INSTANCE!r}.")
         self.normalize_advantage = normalize_advantage
+        self.micro_batch_size = micro_batch_size
         # State from which a resumed run continues as if it had not been interrupted.
         self.stream_seed = draw_seed() if seed is None else seed
         self.baseline_state: dict[str, Any] = {}
@@ -176,6 +184,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} is {value!r}; it must be a whole number of at least 1.")
+        self._micro_batches = MicroBatches(self.micro_batch_size)
         if not self.lr_decay > 0:
             raise ValueError(f"lr_decay is {self.lr_decay}; it must be above 0.")
         if self.baseline not in BASELINES:
@@ -269,7 +278,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         # In training mode and with gradients: the gradient pass uses this encoding too, so that batch normalization acts and
         # learns with the same statistics.
         self.policy.set_training_mode(True)
-        cache = self.policy.encode(instances)
+        size = self._micro_batches.size(self, len(instances))
+        cache = self.policy.encode(instances) if size is None else encode_in_parts(self.policy, instances, size)
         generator = self.action_generator(self.n_batches)
         actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
         with th.no_grad():
@@ -277,7 +287,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
             baseline = self._baseline.of_episodes(problem, instances, returns)
         if not self._report_episodes(env, callback, episodes_by_sample(problem, instances, actions, returns)):
             return False
-        self._batch = EpisodeBatch(instances, cache, actions, returns, baseline)
+        # In micro-batches each is encoded again, with gradients.
+        self._batch = EpisodeBatch(instances, cache if size is None else None, actions, returns, baseline, size)
         callback.on_rollout_end()
         return True
 
@@ -307,9 +318,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         batch, self._batch = self._batch, None
-        loss = step_loss(self) if batch is None else episode_loss(self, batch)
-        self.policy.optimizer.zero_grad()
-        loss.backward()
+        loss = accumulate_gradients(self, batch)
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         require_finite({"loss": loss, "gradient norm": grad_norm}, self._n_updates + 1, self.num_timesteps)
         self.policy.optimizer.step()
@@ -398,7 +407,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
 
     # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L303
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_baseline", "baseline_policy", "_batch", "max_instances"]
+        return [*super()._excluded_save_params(), *_NOT_SAVED]
 
     # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/on_policy_algorithm.py#L343
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
