@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.files import temporary_name
 
 
@@ -24,6 +25,7 @@ def save_atomically(
     :param path: The zip to write; ``.zip`` is appended when missing
     :param exclude: Attributes to leave out
     :param include: Attributes to save although they are left out by default
+    :raises DivergenceError: If the model holds a number that is not finite; an existing file is then left untouched
     :raises OSError: If the file cannot be written; an existing file of the same name is then left untouched
     """
     if not isinstance(path, str | pathlib.Path):
@@ -31,5 +33,7 @@ def save_atomically(
         return
     path = pathlib.Path(path)
     path = path if path.suffix == ".zip" else path.with_name(path.name + ".zip")
+    require_finite_model(model, path)
     with temporary_name(path) as temporary:
         BaseAlgorithm.save(model, temporary, exclude, include)
+    note_saved(model, path)

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 
+from sb3_uav.envs.instance_checks import require_finite_instances
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Dynamics, Problem, Stage
 
@@ -53,11 +54,13 @@ class Episodes:
 
         :param rows: Indices of the rows to reset; all when None
         :param given: Instances (batches of one) to use for some rows instead of drawing them
+        :raises ValueError: If a number in them is NaN or infinite
         """
         given = given or {}
         indices = np.arange(self.n_envs) if rows is None else np.asarray(rows)
         drawn = [self._fit(given.get(int(i)) or self.problem.generator(1, self.rngs[i])) for i in indices]
         fresh = Instances.concatenate(drawn)
+        require_finite_instances(fresh, self.problem.generator)
         if self.state is None or len(indices) == self.n_envs:
             self.instances = fresh
         else:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 import torch as th
 
+from sb3_uav.envs.instance_checks import require_finite_instances
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.sizes import check_size, n_instances_of
 from sb3_uav.envs.world import WorldGenerator
@@ -166,8 +167,11 @@ def training_batch(generator: InstanceGenerator, batch_size: int, rng: np.random
     :param batch_size: Number of instances; a generator of mixed sizes may return fewer
     :param rng: Random generator
     :return: The instances
+    :raises ValueError: If a number in them is NaN or infinite
     """
-    return getattr(generator, "training_batch", generator)(batch_size, rng)
+    instances = getattr(generator, "training_batch", generator)(batch_size, rng)
+    require_finite_instances(instances, generator)
+    return instances
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,30 @@ def check_shapes(instances: Any) -> None:
             )
 
 
+_NUMBERS = ("depot", "tasks", "values", "max_distance", "start", "end", "service")
+
+
+def require_finite_instances(instances: Any, generator: Any) -> None:
+    """
+    The part of :func:`check_contents` that every batch of a training undergoes.
+
+    :param instances: The ``Instances`` that were drawn
+    :param generator: What drew them
+    :raises ValueError: If a number is NaN or infinite; the message names generator, field and place
+    """
+    for name in _NUMBERS:
+        field = getattr(instances, name)
+        if field is not None and not bool(th.isfinite(field.float()).all()):
+            where = tuple(int(i) for i in (~th.isfinite(field.float())).nonzero()[0])
+            # Generators of the router's instances wrap the one of the fleet.
+            generator = getattr(generator, "generator", generator)
+            raise ValueError(
+                f"{getattr(generator, '__name__', type(generator).__name__)} drew an instance whose field '{name}' holds "
+                f"{field[where].item()} at index {where}; every number must be finite in float32. Nothing was learned from "
+                "it: mend the generator, or the file that it reads."
+            )
+
+
 def check_contents(instances: Any) -> None:
     """
     :param instances: The ``Instances``, whose module imports this one
@@ -45,7 +69,7 @@ def check_contents(instances: Any) -> None:
         field = getattr(instances, name)
         if field is not None and field.dtype != th.bool:
             raise ValueError(f"field '{name}' has dtype {field.dtype}; it must be bool.")
-    for name in ("depot", "tasks", "values", "max_distance", "start", "end", "service"):
+    for name in _NUMBERS:
         field = getattr(instances, name)
         if field is not None:
             _check_numbers(name, field)

@@ -224,6 +224,7 @@ class AllocatorPolicy(EpisodicPolicy):
     It takes any number of tasks and, with ``shared_scorer``, of UAVs; the paper's decoder is bound to one fleet size.
     """
 
+    level = "allocator"
     extractor_class: ClassVar[type[AllocatorExtractor]] = AllocatorExtractor
     required_extractor_class = AllocatorExtractor
     features_extractor: AllocatorExtractor

@@ -45,6 +45,8 @@ class EpisodicPolicy(MaskedPolicy):
     See :class:`~sb3_uav.policies.masked_policy.MaskedPolicy` for the arguments.
     """
 
+    # What messages call it.
+    level: ClassVar[str]
     extractor_class: ClassVar[type[EpisodicExtractor]]
     features_extractor: EpisodicExtractor
 

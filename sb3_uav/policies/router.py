@@ -197,6 +197,7 @@ class RouterPolicy(EpisodicPolicy):
     ``net_arch`` shapes the critic only, because the actor's logits are the extractor's compatibilities.
     """
 
+    level = "router"
     extractor_class: ClassVar[type[RouterExtractor]] = RouterExtractor
     required_extractor_class = RouterExtractor
     features_extractor: RouterExtractor

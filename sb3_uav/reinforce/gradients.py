@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.utils import explained_variance
 
 from sb3_uav.reinforce.episode_batch import EpisodeBatch
+from sb3_uav.reinforce.finite import require_finite
 from sb3_uav.reinforce.losses import LossParts, episode_advantages, episode_loss, real_steps, step_loss
 
 
@@ -20,9 +21,11 @@ def accumulate_gradients(model: Any, batch: EpisodeBatch | None) -> th.Tensor:
     :param model: A REINFORCE algorithm, whose logger gets the parts of the loss
     :param batch: The episodes; None to use the steps in its rollout buffer
     :return: The loss, a scalar without gradients
+    :raises DivergenceError: If a baseline or an advantage is not finite
     """
     model.policy.optimizer.zero_grad()
     if batch is None:
+        require_finite(model, advantage=th.as_tensor(model.rollout_buffer.advantages))
         parts = step_loss(model)
         parts.loss.backward()
     else:
@@ -48,6 +51,7 @@ def _accumulate_episodes(model: Any, batch: EpisodeBatch) -> LossParts:
     else:
         model.logger.record("train/baseline", batch.baseline.mean().item())
     advantages = episode_advantages(model, batch, values)
+    require_finite(model, baseline=batch.baseline, advantage=advantages)
     total: LossParts | None = None
     for part, chosen in zip(micro_batches, advantages.split([len(part.instances) for part in micro_batches]), strict=True):
         evaluation = whole or policy.evaluate_episodes(part.instances, part.actions, part.cache)

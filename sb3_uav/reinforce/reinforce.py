@@ -24,6 +24,7 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_uav.common.divergence import report_weights
 from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
@@ -35,7 +36,7 @@ from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
 from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
-from sb3_uav.reinforce.finite import require_finite
+from sb3_uav.reinforce.finite import require_finite, require_finite_returns, require_possible_rate
 from sb3_uav.reinforce.gradients import accumulate_gradients
 from sb3_uav.reinforce.masked_steps import MaskedStepLoop
 from sb3_uav.reinforce.micro_batches import MicroBatches, encode_in_parts
@@ -64,7 +65,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
     instances, are then not available. Settings without effect are reported by a warning. Policies of sb3-contrib get the
     environment's action masks, see :class:`~sb3_uav.reinforce.masked_steps.MaskedStepLoop`.
 
-    Training stops with a ``ValueError`` before an update whose loss or gradient is not finite.
+    Training stops with a :class:`~sb3_uav.common.divergence.DivergenceError` before an update whose returns, baseline,
+    advantages, loss or gradient are not finite, and warns when a weight exceeds 1,000.
 
     :param policy: The policy model to use (MlpPolicy, AllocatorPolicy, RouterPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -105,6 +107,8 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         "MaskedAttentionPolicy": MaskedAttentionPolicy,
     }
 
+    # See sb3_uav.reinforce.finite.watch.
+    checks_its_updates: ClassVar[bool] = True
     # SB3 declares an ActorCriticPolicy, which ours are not.
     policy: ActorCriticPolicy | MaskableActorCriticPolicy  # type: ignore[assignment]
 
@@ -284,6 +288,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
         with th.no_grad():
             returns = problem.returns(instances, actions)
+            require_finite_returns(self, returns)
             baseline = self._baseline.of_episodes(problem, instances, returns)
         if not self._report_episodes(env, callback, episodes_by_sample(problem, instances, actions, returns)):
             return False
@@ -320,8 +325,10 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         batch, self._batch = self._batch, None
         loss = accumulate_gradients(self, batch)
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-        require_finite({"loss": loss, "gradient norm": grad_norm}, self._n_updates + 1, self.num_timesteps)
+        require_finite(self, loss=loss, gradient_norm=grad_norm)
+        require_possible_rate(self, self.policy.optimizer)
         self.policy.optimizer.step()
+        report_weights(self)
         self._n_updates += 1
         self.logger.record("train/loss", loss.item())
         self.logger.record("train/grad_norm", grad_norm.item())

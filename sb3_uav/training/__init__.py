@@ -4,6 +4,7 @@ from sb3_uav.training.fixed_set import FixedSetEvalCallback
 from sb3_uav.training.its import ITSCallback
 from sb3_uav.training.pretrained_router import PretrainedRouterCallback
 from sb3_uav.training.size_grid import SizeGridCallback
+from sb3_uav.training.stop_at_divergence import StopAtDivergence
 
 __all__ = [
     "EpisodeBufferCallback",
@@ -14,4 +15,5 @@ __all__ = [
     "MaskableEpisodeRolloutBuffer",
     "PretrainedRouterCallback",
     "SizeGridCallback",
+    "StopAtDivergence",
 ]

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 
 from sb3_uav.common.callback_tree import siblings, walk_callbacks
+from sb3_uav.common.divergence import DivergenceError
 from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
 
@@ -44,6 +45,7 @@ class BestPair:
         :param model: What was evaluated
         :param router: The router that it was evaluated with; None if there is none that learns
         :param about: Plain data to note beside the digests
+        :raises DivergenceError: If a number of either is not finite; the earlier pair is then untouched
         :raises OSError: If a file cannot be written; the earlier pair is then untouched
         """
 
@@ -82,7 +84,7 @@ class BestPair:
             if write_router is not None or router.is_file() or note.is_file():
                 digests = {"model": file_hash(next_model), "router": None if write_router is None else file_hash(next_router)}
                 write_atomically(note, json.dumps({**digests, **about}, indent=1))
-        except OSError:
+        except (OSError, DivergenceError):
             for path in (next_model, next_router):
                 path.unlink(missing_ok=True)
             raise

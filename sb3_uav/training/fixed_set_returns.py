@@ -7,6 +7,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_uav.common.random_streams import FIXED_SET_ACTION_STREAM, FIXED_SET_STREAM, random_stream, torch_generator
+from sb3_uav.envs.instance_checks import require_finite_instances
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
@@ -23,8 +24,11 @@ def draw_fixed_set(problem: Problem, n_instances: int, seed: int) -> Instances:
     :param n_instances: Number of instances
     :param seed: Seed for drawing them. No training draws the same instances, whatever its seed
     :return: The instances, on the CPU
+    :raises ValueError: If a number in them is NaN or infinite
     """
-    return problem.generator(n_instances, random_stream(seed, FIXED_SET_STREAM))
+    instances = problem.generator(n_instances, random_stream(seed, FIXED_SET_STREAM))
+    require_finite_instances(instances, problem.generator)
+    return instances
 
 
 def evaluate_fixed_set(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import torch as th
 from torch.nn import functional
 
+from sb3_uav.common.divergence import LARGEST_WEIGHT, DivergenceError, first_bad, largest
 from sb3_uav.common.random_streams import torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, training_batch
@@ -30,6 +32,8 @@ _TRIALS_PER_TASK = 12
 _WARM_UP = 50
 _LAST_RATE = 0.02
 _MAX_GRAD_NORM = 1.0
+# Beyond it the first step of Adam is infinite in float32.
+_LARGEST_RATE = 1e35
 _REPORT_EVERY = 250
 # Progress is saved every SAVE_EVERY updates and every CHUNK_SIZE tours.
 _SAVE_EVERY = 500
@@ -70,13 +74,14 @@ def imitate(
     :param share: Part of ``n_subsets`` and ``n_updates`` to do, above 0 and at most 1
     :param record: Called as often with the number of moves learned from so far, those before an interruption included, and
         the mean loss since the last call in nats per move
+    :raises DivergenceError: If a loss, a gradient or a weight is not finite; the progress stays as last saved
     :raises ImportError: If numba is not installed
     :raises OSError: If the progress cannot be written
     :raises ValueError: If a number is not above 0, or the folder holds the progress of other settings or damaged files
     """
     check_counts(1, n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size)
-    if not learning_rate > 0:
-        raise ValueError(f"learning_rate is {learning_rate}; it must be above 0.")
+    if not 0 < learning_rate < _LARGEST_RATE:
+        raise ValueError(f"learning_rate is {learning_rate}; it must be above 0, and below {_LARGEST_RATE:g}.")
     n_subsets, n_updates = math.ceil(share * n_subsets), math.ceil(share * n_updates)
     settings = dict(n_subsets=n_subsets, n_updates=n_updates, batch_size=batch_size, learning_rate=learning_rate)
     progress = None if folder is None else ImitationProgress(Path(folder), settings)
@@ -87,6 +92,7 @@ def imitate(
         report(f"imitation: resumed after {n_done} of {n_updates} updates")
     start, total, n_moves = time.perf_counter(), th.zeros((), dtype=th.float32, device=router.device), 0
     router.set_training_mode(True)
+    exploded = False
     for update in range(n_done + 1, n_updates + 1):
         cosine = 0.5 * (1 + math.cos(math.pi * update / n_updates))
         for group in optimizer.param_groups:
@@ -99,8 +105,18 @@ def imitate(
         loss = -log_prob[is_move].sum() / max(n_new, 1)
         optimizer.zero_grad()
         loss.backward()
-        th.nn.utils.clip_grad_norm_(router.parameters(), _MAX_GRAD_NORM)
+        norm = th.nn.utils.clip_grad_norm_(router.parameters(), _MAX_GRAD_NORM)
+        _require_finite(update, progress, {"imitation loss": loss, "gradient norm of the imitation": norm})
         optimizer.step()
+        name, size = largest(router.named_parameters())
+        _require_finite(update, progress, {f"weight {name}": th.tensor(size)})
+        if size > LARGEST_WEIGHT and not exploded:
+            exploded = True
+            warnings.warn(
+                f"router: The weight {name} has grown to {size:.3g} in update {update} of the imitation, more than "
+                f"{LARGEST_WEIGHT:g}: it is likely to diverge; lower learning_rate of the warm start.",
+                stacklevel=2,
+            )
         total, n_moves, n_learned = total + n_new * loss.detach(), n_moves + n_new, n_learned + n_new
         if update % _REPORT_EVERY == 0 or update == n_updates:
             seconds, nats = time.perf_counter() - start, total.item() / max(n_moves, 1)
@@ -110,6 +126,23 @@ def imitate(
         if progress is not None and update % _SAVE_EVERY == 0:
             progress.save_updates(update, n_learned, router, optimizer, rng)
     router.set_training_mode(False)
+
+
+def _require_finite(update: int, progress: ImitationProgress | None, values: dict[str, th.Tensor]) -> None:
+    """
+    :param update: Number of the update, from 1
+    :param progress: Where the last good state is
+    :param values: Scalars by the name that the error gives them
+    :raises DivergenceError: If one is infinite or NaN
+    """
+    for name, value in values.items():
+        bad = first_bad(value)
+        if bad is not None:
+            saved = "none was kept, as no folder is given" if progress is None else f"{progress.folder} holds it"
+            raise DivergenceError(
+                f"router: The {name} is {bad} in update {update}; nothing was saved since the last good state: {saved}. Train "
+                "with a smaller learning_rate of the warm start."
+            )
 
 
 def _search_lessons(

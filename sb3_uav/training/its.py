@@ -12,18 +12,19 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_uav.common.callback_tree import siblings
+from sb3_uav.common.divergence import DivergenceError
 from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, Moment, log_text
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
-from sb3_uav.common.random_streams import SUBSET_STREAM, TRAINING_STREAM, WARM_START_STREAM, random_stream, stream_seed
+from sb3_uav.common.random_streams import SUBSET_STREAM, WARM_START_STREAM, random_stream, stream_seed
 from sb3_uav.common.sb3_compat import total_timesteps
 from sb3_uav.common.shared_axis import SharedAxis
 from sb3_uav.envs.allocation import AllocationProblem
-from sb3_uav.envs.generators import training_batch
 from sb3_uav.policies import AllocatorPolicy
 from sb3_uav.policies.freezing import Freezer
 from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.recognition import find_problem
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import RouterCallback, take_over
@@ -31,11 +32,10 @@ from sb3_uav.training.its_checkpoint import (
     CHECKPOINT_FOLDER,
     WARM_START_FOLDER,
     begin_anew,
-    check_allocator,
+    find_state,
     n_router_epochs,
     noted_checkpoint,
     origin_of,
-    read_state,
     write_checkpoint,
 )
 from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule, strategy_name
@@ -44,7 +44,7 @@ from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import find_run_folder
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_complete_run, warn_of_large_batches
-from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances
+from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances, new_batches
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
 ROUTER_FILE = "router.zip"
@@ -97,6 +97,7 @@ class ITSCallback(RouterCallback):
     :param resume_from: Folder written by an earlier run (its ``its_checkpoint``); train the allocator loaded from there
     :param checkpoint_freq: Allocator epochs between checkpoints
     :param verbose: Verbosity level: 0 for no output, 1 for a line per epoch
+    :param keep_checkpoints: Number of checkpoints to keep; older ones are removed when a new one is complete
     :raises ValueError: If an argument is not allowed; the message names it
     """
 
@@ -115,9 +116,11 @@ class ITSCallback(RouterCallback):
         checkpoint_freq: int = 1,
         verbose: int = 0,
         warm_start: dict[str, Any] | None = None,
+        keep_checkpoints: int = 3,
     ) -> None:
         super().__init__(verbose)
         check_counts(1, n_epochs=n_epochs, n_continuous_epochs=n_continuous_epochs, checkpoint_freq=checkpoint_freq)
+        check_counts(1, keep_checkpoints=keep_checkpoints)
         self.router_zip, self.router_kwargs = router_source(router)
         if n_pretraining_epochs is None:
             n_pretraining_epochs = _PRETRAINING_EPOCHS if self.router_zip is None else 0
@@ -133,6 +136,7 @@ class ITSCallback(RouterCallback):
         self.save_path = None if save_path is None else Path(save_path)
         self.resume_from = None if resume_from is None else Path(resume_from)
         self.checkpoint_freq = checkpoint_freq
+        self.keep_checkpoints = keep_checkpoints
         self.warm_start = None if warm_start is None else WarmStart(warm_start)
 
         self.records: list[EpochRecord] = []
@@ -169,6 +173,7 @@ class ITSCallback(RouterCallback):
                 "DummyVecEnv (not --vec-env subproc) without wrappers."
             )
         self.problem = problem
+        watch(self.model)
         self.instances_per_epoch = find_epoch_size(self.model, self.instances_per_epoch)
         if self.save_path is None:
             self.save_path = self._find_save_path()
@@ -310,9 +315,8 @@ class ITSCallback(RouterCallback):
 
     def _end_epoch(self) -> None:
         """Lines 10 to 23 of Algorithm 1, after every epoch of the allocator."""
-        assert self.instances_per_epoch is not None
         self.epoch += 1
-        end = self.epoch * self.instances_per_epoch if self._epoch_is_over() else self._instances_seen()
+        end = self.epoch * (self.instances_per_epoch or 0) if self._epoch_is_over() else self._instances_seen()
         phase = self.schedule.phase(self.epoch)
         objective = self._statistics.mean_return
         if self._statistics.n_episodes == 0:
@@ -331,11 +335,14 @@ class ITSCallback(RouterCallback):
     def _train_on_subsets(self, n_epochs: int, fraction: float, phase: str) -> None:
         assert isinstance(self.model.policy, AllocatorPolicy)
         n_batches = getattr(self.model, "n_batches", 0) - self._epoch_first_batch
+        draw_batch: Any
         if isinstance(self.model, REINFORCE):
             first, draw_batch = self._epoch_first_batch, self.model.draw_batch
         else:
             # SB3's algorithms cannot replay their instances; draw new ones from the same distribution.
-            first, n_batches, draw_batch = 0, self._batches_per_epoch(), self._draw_new_batch
+            n_envs = self.training_env.num_envs
+            first, n_batches = 0, -(-(self.instances_per_epoch or 0) // n_envs)
+            draw_batch = new_batches(self.model.policy, self.problem.generator, n_envs, self._seed(), self.epoch)
         self._subsets = AllocatedSubsets(
             self.model.policy,
             self.problem.generator,
@@ -353,17 +360,8 @@ class ITSCallback(RouterCallback):
             self._trainer.freezer.freeze()
             self._allocator_freezer.thaw()
 
-    def _batches_per_epoch(self) -> int:
-        assert self.instances_per_epoch is not None
-        return -(-self.instances_per_epoch // self.training_env.num_envs)
-
-    def _draw_new_batch(self, index: int) -> Any:
-        rng = random_stream(self._seed(), TRAINING_STREAM, self.epoch, index)
-        assert isinstance(self.model.policy, AllocatorPolicy)
-        return self.model.policy.arrange(training_batch(self.problem.generator, self.training_env.num_envs, rng))
-
     def _seed(self) -> int:
-        """Seed of the streams for warm start and router instances, saved in the allocator's zips."""
+        # Of the streams for warm start and router instances, saved in the allocator's zips.
         return stream_seed(self.model)
 
     def _train_router(self, n_epochs: int, phase: str, first: int = 0) -> None:
@@ -383,6 +381,10 @@ class ITSCallback(RouterCallback):
             with_bar, close_bar = router_progress(self, description, size)
             try:
                 n_instances = self._trainer.learn(size, self._planned_before() + size, statistics, with_bar)
+            except DivergenceError as error:
+                # rl_zoo3 ends the training even after an error, but this router must not be saved.
+                self._started = False
+                raise DivergenceError(f"Router epoch {number} ({phase}), {error}") from error
             finally:
                 close_bar()
             generation = self._generation_seconds() - generated_before
@@ -432,14 +434,12 @@ class ITSCallback(RouterCallback):
         self._axis.note()
         self._save_router()
         if self.save_path is not None:
-            folder = self.save_path / CHECKPOINT_FOLDER
-            begun = (self._warm_started, self._share, self._origin)
-            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, *begun)
+            folder, begun = self.save_path / CHECKPOINT_FOLDER, (self._warm_started, self._share, self._origin)
+            write_checkpoint(folder, self.model, self.router, self.epoch, self.records, *begun, self.keep_checkpoints)
 
     def _resume(self, folder: Path) -> float | None:
         """:return: The share of the plan with which the run began, unless an older version wrote the checkpoint"""
-        state = read_state(folder)
-        check_allocator(folder, state, self.model)
+        state = find_state(folder, self.model)
         self.epoch = state["epoch"]
         warn_of_complete_run(folder, self.epoch, self.n_epochs)
         # Versions that did not write this field saved no checkpoint before the end of the warm start.

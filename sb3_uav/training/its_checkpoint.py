@@ -12,15 +12,16 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.epoch_log import EpochRecord
 from sb3_uav.common.files import file_hash, write_atomically
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.generators import InstanceGenerator
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.training.kept_checkpoints import STATE_FILE, earlier_states, keep_previous, remove_old
 
 CHECKPOINT_FOLDER = "its_checkpoint"
-STATE_FILE = "its_state.json"
 WARM_START_FOLDER = "warm_start"
 # An attribute of the allocator, so that every zip of it names its last checkpoint: stock rl_zoo3 does not tell callbacks
 # which zip a run continues.
@@ -36,6 +37,7 @@ def write_checkpoint(
     warm_started: bool,
     share: float,
     origin: str | None,
+    keep: int = 1,
 ) -> None:
     """
     Write both zips and the state of the strategy.
@@ -50,8 +52,12 @@ def write_checkpoint(
     :param warm_started: Whether the router's warm start, if there is one, is over
     :param share: The part of the planned steps to which warm start and pre-training were cut
     :param origin: What the run started from, see :func:`origin_of`
+    :param keep: Number of checkpoints to keep, this one included
+    :raises DivergenceError: If a number in either model is not finite; the earlier checkpoint is then untouched
     :raises OSError: If a file cannot be written
     """
+    for model in (allocator, router):
+        require_finite_model(model, folder)
     # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
     n_instances = getattr(allocator, "n_instances", None)
     noted = {"folder": str(folder.resolve()), "epoch": epoch, "n_instances": n_instances, "origin": origin}
@@ -63,10 +69,11 @@ def write_checkpoint(
     save_atomically(router, folder / names["router"])
     state = {"epoch": epoch, **names, "warm_started": warm_started, "share": share}
     state["records"] = [asdict(record) for record in records]
+    keep_previous(folder, names)
     write_atomically(folder / STATE_FILE, json.dumps(state, indent=1))
-    for old in folder.iterdir():
-        if re.fullmatch(r"(allocator|router)_(\d+|start)\.zip", old.name) and old.name not in names.values():
-            old.unlink()
+    for model in (allocator, router):
+        note_saved(model, folder / names["allocator"], is_checkpoint=True)
+    remove_old(folder, keep)
 
 
 def n_router_epochs(records: Sequence[EpochRecord]) -> int:
@@ -128,15 +135,16 @@ def begin_anew(allocator: BaseAlgorithm, router: Path | None) -> None:
         allocator.n_instances = allocator.epoch = 0
 
 
-def read_state(folder: Path) -> dict[str, Any]:
+def read_state(folder: Path, file: str | None = None) -> dict[str, Any]:
     """
     :param folder: A checkpoint of :class:`~sb3_uav.training.ITSCallback`
+    :param file: Name of the state file of an earlier checkpoint there; the last one when None
     :return: The contents of its state file: ``epoch``, ``allocator`` and ``router`` (names of the zips), ``records``, and,
         unless an older version wrote it, ``warm_started`` and ``share``
     :raises FileNotFoundError: If there is none
     :raises ValueError: If it is damaged
     """
-    path = Path(folder) / STATE_FILE
+    path = Path(folder) / (STATE_FILE if file is None else file)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
     try:
@@ -198,14 +206,50 @@ def check_allocator(folder: Path, state: dict[str, Any], allocator: BaseAlgorith
     :param allocator: What is going to learn
     :raises ValueError: If it is not the allocator of this checkpoint
     """
-    noted = getattr(allocator, CHECKPOINT, None)
-    noted = noted if isinstance(noted, dict) else {}
-    epoch = noted.get("epoch", state["epoch"])
-    if isinstance(allocator, REINFORCE) and noted.get("n_instances") != allocator.n_instances:
-        # Not the zip of the checkpoint itself: it must not have completed another epoch since.
-        epoch = allocator.epoch
+    epoch = _epoch_of(allocator, state["epoch"])
     if epoch != state["epoch"]:
         raise ValueError(
             f"{folder}: the checkpoint is of epoch {state['epoch']}, the allocator of epoch {epoch}; "
             f"train the allocator of {folder / state['allocator']}."
         )
+
+
+def _epoch_of(allocator: BaseAlgorithm, otherwise: int) -> Any:
+    """:return: The epoch of the checkpoint that the allocator belongs to"""
+    noted = getattr(allocator, CHECKPOINT, None)
+    noted = noted if isinstance(noted, dict) else {}
+    if isinstance(allocator, REINFORCE) and noted.get("n_instances") != allocator.n_instances:
+        # Not the zip of the checkpoint itself: it must not have completed another epoch since.
+        return allocator.epoch
+    return noted.get("epoch", otherwise)
+
+
+def find_state(folder: Path, allocator: BaseAlgorithm) -> dict[str, Any]:
+    """
+    :param folder: A checkpoint
+    :param allocator: What is going to learn
+    :return: The state of the last checkpoint there, or that of the kept one that the allocator belongs to
+    :raises FileNotFoundError: If there is none
+    :raises ValueError: If a state file is damaged, or the allocator belongs to none of them
+    """
+    state = read_state(folder)
+    epoch = _epoch_of(allocator, state["epoch"])
+    # A new allocator is at epoch 0, but belongs to no checkpoint.
+    if epoch != state["epoch"] and isinstance(getattr(allocator, CHECKPOINT, None), dict):
+        earlier = (read_state(folder, file.name) for file in earlier_states(folder))
+        state = next((other for other in earlier if other["epoch"] == epoch), state)
+    check_allocator(folder, state, allocator)
+    note_saved(allocator, folder / state["allocator"], is_checkpoint=True)
+    return state
+
+
+def router_of(folder: Path, allocator: str) -> str:
+    """
+    :param folder: A checkpoint
+    :param allocator: Name of an allocator's zip there
+    :return: Name of the router's zip of the same checkpoint, the last one for other allocators
+    :raises FileNotFoundError: If there is no checkpoint
+    :raises ValueError: If a state file is damaged
+    """
+    states = [read_state(folder), *(read_state(folder, file.name) for file in earlier_states(folder))]
+    return next((state["router"] for state in states if state["allocator"] == allocator), states[0]["router"])

@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_uav.common.divergence import note_saved
 from sb3_uav.common.epoch_log import EpisodeStatistics
 from sb3_uav.common.random_state import undisturbed_random_state
 from sb3_uav.common.saving import save_atomically
@@ -24,6 +25,7 @@ from sb3_uav.policies import RouterPolicy
 from sb3_uav.policies.freezing import Freezer
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.algorithms import resolve_algorithm
+from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.transfer import fine_tuning_settings, load
 from sb3_uav.training.episode_buffer import use_episode_buffer
 from sb3_uav.training.subsets import WholeInstances
@@ -145,6 +147,7 @@ class RouterTrainer:
         observation: Any = self.env.reset()
         set_last_observation(self.algorithm, observation)
         self.freezer = Freezer(self.policy)
+        watch(self.algorithm)
 
     def learn(self, size: int, planned: int, statistics: EpisodeStatistics, others: list[BaseCallback]) -> int:
         """
@@ -195,4 +198,5 @@ class RouterTrainer:
             raise ValueError(f"{path}: not an intact router ({error}); use another checkpoint.") from error
         loaded.set_logger(self.algorithm.logger)
         self.algorithm = loaded
+        note_saved(loaded, path, is_checkpoint=True)
         self._prepare()

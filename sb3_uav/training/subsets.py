@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch as th
 
-from sb3_uav.common.random_streams import torch_generator
+from sb3_uav.common.random_streams import TRAINING_STREAM, random_stream, torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, goes_beyond_the_paper, training_batch
 from sb3_uav.envs.instances import Instances
@@ -148,3 +148,22 @@ class AllocatedSubsets(SingleUavGenerator):
         rows = th.arange(len(instances), device="cpu").split(_HELD_OUT_ROWS)
         subsets = Instances.concatenate([self._allocate(instances[part], rng) for part in rows])
         return subsets[rng.permutation(len(subsets))[:batch_size]]
+
+
+def new_batches(
+    allocator: AllocatorPolicy, generator: InstanceGenerator, n_envs: int, seed: int, epoch: int
+) -> Callable[[int], Instances]:
+    """
+    :param allocator: The policy of the allocator
+    :param generator: Draws the instances
+    :param n_envs: Number of instances of a batch
+    :param seed: Seed of the random streams
+    :param epoch: Epoch of the allocator
+    :return: A function of the number of a batch, which draws instances that no training has seen
+    """
+
+    def draw(index: int) -> Instances:
+        rng = random_stream(seed, TRAINING_STREAM, epoch, index)
+        return allocator.arrange(training_batch(generator, n_envs, rng))
+
+    return draw

@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.callbacks import CheckpointCallback
 
 from sb3_uav.common.callback_tree import siblings
+from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.saving import save_atomically
+from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, RouterCallback, find_best_router
 from sb3_uav.training.its import ROUTER_FILE
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state, router_of
+from sb3_uav.training.kept_checkpoints import oldest
 
 _MODEL_FILE = re.compile(r"rl_model_(\d+)_steps\.zip")
+_ROUTER_FILE = re.compile(r"router_(\d+)_steps\.zip")
 
 
 class PairCheckpointCallback(CheckpointCallback):
     """
     SB3's callback, which saves ``rl_model_<steps>_steps.zip``. The router of that moment, if a callback trains one, goes into
-    ``router_<steps>_steps.zip`` beside it.
+    ``router_<steps>_steps.zip`` beside it. What is not finite is not saved.
+
+    :param keep: Number of checkpoints to keep; older ones are removed when a new one is complete; all when None
+    :raises ValueError: If ``keep`` is no whole number of at least 1
     """
+
+    def __init__(self, *args: Any, keep: int | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        check_counts(1, keep=keep)
+        self.keep = keep
 
     @classmethod
     def of(cls, stock: CheckpointCallback) -> PairCheckpointCallback:
@@ -32,13 +45,22 @@ class PairCheckpointCallback(CheckpointCallback):
 
     # https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/callbacks.py#L306
     def _on_step(self) -> bool:
-        if self.n_calls % self.save_freq == 0:
+        is_due = self.n_calls % self.save_freq == 0
+        model = Path(self._checkpoint_path(extension="zip"))
+        if is_due:
+            require_finite_model(self.model, model)
             # Before the allocator, so that none is without its router, however the process ends.
-            model = Path(self._checkpoint_path(extension="zip"))
             # Abstract classes: https://github.com/python/mypy/issues/4717
             for training in siblings(self, RouterCallback):  # type: ignore[type-abstract]
                 save_atomically(training.router, model.with_name(_router_file(model)))
-        return super()._on_step()
+        goes_on = super()._on_step()
+        if is_due:
+            note_saved(self.model, model)
+            if self.keep is not None:
+                for number in (_MODEL_FILE, _ROUTER_FILE):
+                    for old in oldest(model.parent.iterdir(), number, self.keep):
+                        old.unlink(missing_ok=True)
+        return goes_on
 
 
 def _router_file(model: Path) -> str:
@@ -63,7 +85,7 @@ def find_router(allocator: Path) -> Path | None:
     """
     folder = allocator.parent
     if (folder / STATE_FILE).is_file():
-        return folder / read_state(folder)["router"]
+        return folder / router_of(folder, allocator.name)
     is_checkpoint = _MODEL_FILE.fullmatch(allocator.name) is not None
     own = find_best_router(folder) if allocator.name == BEST_MODEL_FILE else None
     if is_checkpoint and (same_moment := allocator.with_name(_router_file(allocator))).is_file():

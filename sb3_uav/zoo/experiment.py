@@ -12,14 +12,16 @@ import gymnasium as gym
 from huggingface_sb3 import EnvironmentName
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
+from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.transfer import load
-from sb3_uav.training import FixedSetEvalCallback, ITSCallback
+from sb3_uav.training import FixedSetEvalCallback, ITSCallback, StopAtDivergence
 from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
@@ -128,11 +130,18 @@ class UAVExperimentManager(ExperimentManager):
             raise ValueError(f"{self._where}: {error}") from error
 
     def learn(self, model: BaseAlgorithm) -> None:
+        watch(model)
+        if self.continue_training:
+            note_saved(model, Path(self.trained_agent))
         try:
             super().learn(model)
         except (TypeError, OverflowError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        require_finite_model(model, self.save_path)
+        super().save_trained_model(model)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         env = super().create_envs(n_envs, eval_env, no_log)
@@ -200,6 +209,9 @@ class UAVExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
+        # Before what saves files, but not in the place of the progress bar, whose end rl_zoo3 calls.
+        saves = bool(self.callbacks) and isinstance(self.callbacks[0], EventCallback | CheckpointCallback)
+        self.callbacks.insert(0 if saves else 1, StopAtDivergence())
         self.callbacks = [
             PairCheckpointCallback.of(callback) if type(callback) is CheckpointCallback else callback
             for callback in self.callbacks
