@@ -66,9 +66,10 @@ def process_group() -> Iterator[None]:
     has_gpus = th.cuda.is_available() and th.cuda.device_count() >= n_local and dist.is_nccl_available()
     if has_gpus:
         th.cuda.set_device(local_rank)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if has_gpus else "gloo", timeout=_TIMEOUT)
-    # Of its own, so that the name cannot meet one of torch's.
-    store = dist.PrefixStore("sb3_uav", dist.distributed_c10d._get_default_store())
+    root, number, size = next(dist.rendezvous("env://", timeout=_TIMEOUT))
+    backend = "cpu:gloo,cuda:nccl" if has_gpus else "gloo"
+    dist.init_process_group(backend, store=dist.PrefixStore("group", root), rank=number, world_size=size, timeout=_TIMEOUT)
+    store = dist.PrefixStore("errors", root)
     try:
         yield
         # Nobody ends, and takes the connection with it, while another one still works.

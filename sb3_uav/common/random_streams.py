@@ -67,6 +67,41 @@ def torch_generator(rng: np.random.Generator, device: th.device | str) -> th.Gen
     return th.Generator(device).manual_seed(int(rng.integers(2**63 - 1)))
 
 
+class PartGenerator(th.Generator):
+    """
+    A generator for some rows of a batch, which get the numbers that they would get if all rows were there.
+
+    So the actions of a batch do not depend on how many processes share it.
+    """
+
+    rows: slice
+    n_rows: int
+
+    @classmethod
+    def of(cls, generator: th.Generator, rows: slice, n_rows: int) -> PartGenerator:
+        """
+        :param generator: A generator for the whole batch
+        :param rows: The rows that are there
+        :param n_rows: Number of rows of the whole batch
+        :return: A generator in the state of the other, for these rows
+        """
+        part = cls(generator.device)
+        part.set_state(generator.get_state())
+        part.rows, part.n_rows = rows, n_rows
+        return part
+
+
+def exponential_noise(like: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+    """
+    :param like: ``(batch, ...)``
+    :param generator: Source of randomness, on the same device
+    :return: Exponentially distributed numbers of the same shape
+    """
+    if not isinstance(generator, PartGenerator):
+        return th.empty_like(like).exponential_(generator=generator)
+    return like.new_empty((generator.n_rows, *like.shape[1:])).exponential_(generator=generator)[generator.rows]
+
+
 def draw_seed() -> int:
     """
     :return: A seed below 2**32 that differs from call to call, independent of the state of the global generators

@@ -8,6 +8,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
+from sb3_uav.common import distributed
 from sb3_uav.policies.geometry import (
     NodeFeature,
     WholeDepotFeature,
@@ -90,10 +91,37 @@ class _NodeNorm(nn.Module):
             return self.norm(nodes, node_mask)
         if not isinstance(self.norm, nn.BatchNorm1d):
             return self.norm(nodes)
+        if self.norm.training and distributed.world_size() > 1:
+            rows = nodes.flatten(0, 1) if node_mask is None else nodes[node_mask]
+            normalized = _normalized_over_ranks(self.norm, rows.float()).to(nodes.dtype)
+            return normalized.view_as(nodes) if node_mask is None else nodes.masked_scatter(node_mask[..., None], normalized)
         if node_mask is None or not self.norm.training:
             # In evaluation mode no node has an influence on another.
             return self.norm(nodes.flatten(0, 1)).view_as(nodes)
         return nodes.masked_scatter(node_mask[..., None], self.norm(nodes[node_mask]))
+
+
+def _normalized_over_ranks(norm: nn.BatchNorm1d, rows: th.Tensor) -> th.Tensor:
+    """
+    Batch normalization in training mode with the statistics of all processes.
+
+    Torch's ``SyncBatchNorm`` is for GPUs only.
+
+    :param norm: The module, whose running statistics are updated
+    :param rows: ``(n_rows, embed_dim)``, those of this process
+    :return: ``(n_rows, embed_dim)``
+    """
+    count = distributed.total(len(rows))
+    mean = distributed.sum_with_gradient(rows.sum(0)) / count
+    centered = rows - mean
+    variance = distributed.sum_with_gradient((centered**2).sum(0)) / count
+    assert norm.running_mean is not None and norm.running_var is not None and norm.num_batches_tracked is not None
+    assert norm.momentum is not None
+    with th.no_grad():
+        norm.num_batches_tracked += 1
+        norm.running_mean.lerp_(mean, norm.momentum)
+        norm.running_var.lerp_(variance * (count / (count - 1)), norm.momentum)
+    return centered * ((variance + norm.eps).rsqrt() * norm.weight) + norm.bias
 
 
 class SelfAttention(nn.Module):

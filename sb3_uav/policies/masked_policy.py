@@ -20,6 +20,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_uav.common.imports import import_object
+from sb3_uav.common.random_streams import exponential_noise
 from sb3_uav.policies.extractor import EncodeOnceExtractor
 from sb3_uav.policies.grouping import EPISODE_INDEX
 from sb3_uav.policies.settings import NetworkSettings
@@ -40,7 +41,7 @@ def sample_actions(logits: th.Tensor, deterministic: bool, generator: th.Generat
     if deterministic:
         return logits.argmax(-1)
     # Gumbel-max: illegal actions stay at -inf, and the exponential draw is never 0.
-    noise = th.empty_like(logits).exponential_(generator=generator)
+    noise = exponential_noise(logits, generator)
     return (logits - noise.clamp(min=th.finfo(logits.dtype).tiny).log()).argmax(-1)
 
 

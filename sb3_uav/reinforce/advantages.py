@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
+from sb3_uav.common import distributed
 from sb3_uav.reinforce.baselines import Baseline
 
 # Value of ``normalize_advantage``.
@@ -20,6 +21,19 @@ def scale_advantages(advantages: th.Tensor) -> th.Tensor:
     :return: The advantages divided by their standard deviation; a single advantage is returned unchanged
     """
     return advantages / (advantages.std() + _EPSILON) if advantages.numel() > 1 else advantages
+
+
+def scale_steps(advantages: th.Tensor) -> th.Tensor:
+    """
+    :param advantages: ``(n_steps,)``, those of this process
+    :return: The advantages divided by the standard deviation over all processes, as :func:`scale_advantages` does
+    """
+    if distributed.world_size() == 1:
+        return scale_advantages(advantages)
+    count = distributed.total(advantages.numel())
+    mean = distributed.total(float(advantages.double().sum())) / count
+    squares = distributed.total(float(((advantages.double() - mean) ** 2).sum()))
+    return advantages / ((squares / max(count - 1, 1)) ** 0.5 + _EPSILON)
 
 
 def scale_by_instance(advantages: th.Tensor) -> th.Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.logger import Logger
 
+from sb3_uav.common import distributed
 from sb3_uav.common.random_streams import HELD_OUT_STREAM, random_stream
 from sb3_uav.common.statistics import significantly_positive
 from sb3_uav.envs.instances import Instances
@@ -121,7 +122,14 @@ class _ExponentialBaseline(Baseline):
         return state["mean_return"]
 
     def of_episodes(self, problem: Problem, instances: Instances, returns: th.Tensor) -> th.Tensor:
-        return th.full_like(returns[:1, :1], self._update(returns.mean().item()))
+        # Instances are shared out evenly, but for one; the mean is weighted by their numbers.
+        n_rows = distributed.total(len(returns))
+        mean = (
+            returns.mean().item()
+            if distributed.world_size() == 1
+            else distributed.total(returns.mean(1).sum().item()) / n_rows
+        )
+        return th.full_like(returns[:1, :1], self._update(mean))
 
     def of_steps(self, returns: np.ndarray, values: np.ndarray) -> np.ndarray:
         return np.full((1, 1), self._update(float(np.nanmean(returns))))
@@ -192,12 +200,14 @@ class _RolloutBaseline(Baseline):
         policy, copy = self.model.policy, self.model.baseline_policy
         draw = getattr(problem.generator, "held_out", problem.generator)
         instances = draw(self.n_test_instances, random_stream(self.model.stream_seed, HELD_OUT_STREAM, self.model.epoch))
-        instances = copy.arrange(instances)
+        n_instances = len(instances)
+        instances = copy.arrange(instances)[distributed.shard(n_instances)]
         gains = []
         for rows in th.arange(len(instances), device=instances.device).split(_TEST_ROWS):
             part = instances[rows].to(self.model.device)
             gains.append((_greedy_returns(policy, problem, part) - _greedy_returns(copy, problem, part)).cpu())
-        gain = th.cat(gains).flatten().numpy()
+        # All processes test the same numbers, so that they come to the same decision.
+        gain = distributed.gather(th.cat(gains).flatten(), n_instances).numpy()
         replaced = significantly_positive(gain, self.alpha)
         if replaced:
             copy.load_state_dict(deepcopy(policy.state_dict()))

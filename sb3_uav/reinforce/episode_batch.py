@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_uav.common import distributed
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies.extractor import Cache
@@ -17,12 +18,14 @@ class EpisodeBatch(NamedTuple):
     """
     Complete episodes on which the next update is computed.
 
-    :param instances: ``batch`` instances
+    :param instances: ``batch`` instances, those of this process
     :param cache: The encodings of the instances, with gradients; None if each micro-batch is to be encoded by itself
     :param actions: ``(batch, n_samples, n_steps)`` int64
     :param returns: ``(batch, n_samples)`` float64
     :param baseline: Baseline values, float64, broadcastable against ``returns``
     :param micro_batch_size: Number of instances whose gradients are computed at once; all when None
+    :param shared: Number of instances of the update in all processes; those of this one when None
+    :param n_steps: Number of steps of the episodes of all processes, padding left out; None where it is not needed
     """
 
     instances: Instances
@@ -31,6 +34,29 @@ class EpisodeBatch(NamedTuple):
     returns: th.Tensor
     baseline: th.Tensor
     micro_batch_size: int | None = None
+    shared: int | None = None
+    n_steps: float | None = None
+
+    @property
+    def n_instances(self) -> int:
+        """Instances of the update in all processes."""
+        return len(self.instances) if self.shared is None else self.shared
+
+    @property
+    def rows(self) -> slice:
+        """Which of them are those of this process."""
+        return distributed.shard(self.n_instances)
+
+    @property
+    def weight(self) -> float:
+        """The part that this process contributes to a mean over the instances of all."""
+        # Where there are fewer instances than processes, each process has all of them.
+        n_all = (
+            distributed.world_size() * len(self.instances)
+            if self.rows.stop - self.rows.start == self.n_instances
+            else self.n_instances
+        )
+        return len(self.instances) / n_all
 
     def micro_batches(self) -> list[EpisodeBatch]:
         """:return: The parts whose gradients are computed one after the other; the batch itself if there is one"""
@@ -97,6 +123,21 @@ class Step(NamedTuple):
     rewards: np.ndarray
     dones: np.ndarray
     infos: list[dict[str, Any]]
+
+
+def episodes_of_all(samples: list[PlayedEpisodes], n_instances: int) -> list[PlayedEpisodes]:
+    """
+    :param samples: The episodes of this process
+    :param n_instances: Number of instances of the update in all processes
+    :return: The episodes of all processes, so that each of them counts the same steps
+    """
+    if distributed.world_size() == 1:
+        return samples
+
+    def gathered(field: np.ndarray | None) -> Any:
+        return None if field is None else distributed.gather(th.as_tensor(field, device="cpu"), n_instances).numpy()
+
+    return [PlayedEpisodes(*(gathered(field) for field in played)) for played in samples]
 
 
 def steps_of_episodes(played: PlayedEpisodes, n_steps: int) -> Iterator[Step]:

@@ -7,6 +7,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.utils import explained_variance
 
+from sb3_uav.common import distributed
 from sb3_uav.reinforce.episode_batch import EpisodeBatch
 from sb3_uav.reinforce.finite import require_finite
 from sb3_uav.reinforce.losses import LossParts, episode_advantages, episode_loss, real_steps, step_loss
@@ -29,7 +30,8 @@ def accumulate_gradients(model: Any, batch: EpisodeBatch | None) -> th.Tensor:
         parts = step_loss(model)
         parts.loss.backward()
     else:
-        parts = _accumulate_episodes(model, batch)
+        parts = _summed_over_ranks(_accumulate_episodes(model, batch))
+        distributed.sum_gradients(list(model.policy.parameters()))
     model.logger.record("train/policy_gradient_loss", parts.policy.item())
     model.logger.record("train/entropy_loss", -parts.entropy.item())
     if parts.value is not None:
@@ -45,11 +47,12 @@ def _accumulate_episodes(model: Any, batch: EpisodeBatch) -> LossParts:
     if model.baseline == "critic":
         values = whole.values.detach() if whole is not None else _values(model, micro_batches)
         real = real_steps(model, batch)
+        batch = batch._replace(n_steps=distributed.total(int(real.sum())))
         to_go = batch.rewards_to_go(model.problem)[real]
         variance = explained_variance(values[real].cpu().numpy(), to_go.cpu().numpy())
         model.logger.record("train/explained_variance", float(variance))
     else:
-        model.logger.record("train/baseline", batch.baseline.mean().item())
+        model.logger.record("train/baseline", distributed.total(batch.weight * batch.baseline.mean().item()))
     advantages = episode_advantages(model, batch, values)
     require_finite(model, baseline=batch.baseline, advantage=advantages)
     total: LossParts | None = None
@@ -60,6 +63,13 @@ def _accumulate_episodes(model: Any, batch: EpisodeBatch) -> LossParts:
         total = loss.detach() if total is None else total.plus(loss.detach())
     assert total is not None
     return total
+
+
+def _summed_over_ranks(parts: LossParts) -> LossParts:
+    """:return: The parts of the loss of all processes, so that all of them decide alike whether it is finite"""
+    if distributed.world_size() == 1:
+        return parts
+    return LossParts(*(None if part is None else th.as_tensor(distributed.total(part.item())) for part in parts))  # type: ignore[arg-type]
 
 
 @th.no_grad()

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import torch as th
 
+from sb3_uav.common import distributed
 from sb3_uav.policies.base import EpisodeEvaluation
-from sb3_uav.reinforce.advantages import BY_INSTANCE, scale_advantages, scale_by_instance
+from sb3_uav.reinforce.advantages import BY_INSTANCE, scale_advantages, scale_by_instance, scale_steps
 from sb3_uav.reinforce.episode_batch import EpisodeBatch
 
 
@@ -59,7 +60,9 @@ def episode_advantages(model: Any, batch: EpisodeBatch, values: th.Tensor | None
         n_steps)``, 0 after the end of an episode
     """
     if values is None:
-        return _normalized(model, (batch.returns - batch.baseline).float())[..., None]
+        # Of the whole batch, whichever processes share it, so that all divide by the same numbers.
+        everywhere = distributed.gather((batch.returns - batch.baseline).float(), batch.n_instances)
+        return _normalized(model, everywhere)[batch.rows][..., None]
     real = real_steps(model, batch)
     advantages = th.zeros_like(values)
     advantages[real] = _normalized(model, batch.rewards_to_go(model.problem)[real] - values[real])
@@ -77,15 +80,16 @@ def episode_loss(
     :param evaluation: The policy's view of them, with gradients
     :param advantages: Their part of :func:`episode_advantages`
     :param whole: All episodes of the update
-    :return: What these episodes contribute to the loss of all of them
+    :return: What these episodes contribute to the loss of all of them, in all processes
     """
-    share = len(batch.instances) / len(whole.instances)
+    share = len(batch.instances) / len(whole.instances) * whole.weight
     policy_loss = -(advantages * evaluation.log_prob).sum(-1).mean() * share
     value_loss = None
     if model.baseline == "critic":
+        assert whole.n_steps is not None
         real = real_steps(model, batch)
         errors = batch.rewards_to_go(model.problem)[real] - evaluation.values[real]
-        value_loss = (errors**2).sum() / real_steps(model, whole).sum()
+        value_loss = (errors**2).sum() / whole.n_steps
     return _parts(model, policy_loss, evaluation.entropy.sum(-1).mean() * share, value_loss)
 
 
@@ -109,7 +113,9 @@ def _normalized(model: Any, advantages: th.Tensor) -> th.Tensor:
     # The critic's advantages are those of steps, not of episodes.
     if model.normalize_advantage == BY_INSTANCE and advantages.dim() == 2:
         return scale_by_instance(advantages)
-    return scale_advantages(advantages) if model.normalize_advantage else advantages
+    if not model.normalize_advantage:
+        return advantages
+    return scale_steps(advantages) if advantages.dim() == 1 else scale_advantages(advantages)
 
 
 def _parts(model: Any, policy_loss: th.Tensor, entropy: th.Tensor, value_loss: th.Tensor | None) -> LossParts:

@@ -24,8 +24,16 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_uav.common import distributed
 from sb3_uav.common.divergence import report_weights
-from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
+from sb3_uav.common.random_streams import (
+    ACTION_STREAM,
+    TRAINING_STREAM,
+    PartGenerator,
+    draw_seed,
+    random_stream,
+    torch_generator,
+)
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
@@ -35,12 +43,19 @@ from sb3_uav.reinforce.advantages import BY_INSTANCE, complete_steps, step_advan
 from sb3_uav.reinforce.any_size import AnySizeAlgorithm
 from sb3_uav.reinforce.baselines import BASELINES, Baseline
 from sb3_uav.reinforce.drivers import warn_of_ignored_settings, why_step_loop
-from sb3_uav.reinforce.episode_batch import EpisodeBatch, PlayedEpisodes, episodes_by_sample, steps_of_episodes
+from sb3_uav.reinforce.episode_batch import (
+    EpisodeBatch,
+    PlayedEpisodes,
+    episodes_by_sample,
+    episodes_of_all,
+    steps_of_episodes,
+)
 from sb3_uav.reinforce.finite import require_finite, require_finite_returns, require_possible_rate
 from sb3_uav.reinforce.gradients import accumulate_gradients
 from sb3_uav.reinforce.masked_steps import MaskedStepLoop
 from sb3_uav.reinforce.micro_batches import MicroBatches, encode_in_parts
 from sb3_uav.reinforce.monitor_rows import log_episodes
+from sb3_uav.reinforce.ranks import begin_together
 from sb3_uav.reinforce.recognition import find_problem
 
 SelfT = TypeVar("SelfT", bound="REINFORCE")
@@ -64,6 +79,9 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
     episodes that are completed in them are used for training; the baselines ``shared`` and ``rollout``, which replay
     instances, are then not available. Settings without effect are reported by a warning. Policies of sb3-contrib get the
     environment's action masks, see :class:`~sb3_uav.reinforce.masked_steps.MaskedStepLoop`.
+
+    Under ``torchrun`` (see :mod:`sb3_uav.common.distributed`) the fused driver shares the ``n_envs`` instances of an update
+    among the processes; the update is that of a single process, but for rounding.
 
     Training stops with a :class:`~sb3_uav.common.divergence.DivergenceError` before an update whose returns, baseline,
     advantages, loss or gradient are not finite, and warns when a weight exceeds 1,000.
@@ -250,6 +268,15 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         """
         return torch_generator(random_stream(self.stream_seed, ACTION_STREAM, counter), self.device)
 
+    def _draw_part(self) -> tuple[Instances, int, th.Generator]:
+        """:return: Instances of the next update that this process plays, their number in all, and the actions' generator"""
+        instances, generator = self.draw_batch(self.n_batches), self.action_generator(self.n_batches)
+        n_instances = len(instances)
+        if distributed.world_size() == 1:
+            return instances.to(self.device), n_instances, generator
+        rows = distributed.shard(n_instances)
+        return instances[rows].to(self.device), n_instances, PartGenerator.of(generator, rows, n_instances)
+
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
@@ -278,22 +305,22 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         callback.on_rollout_start()
         if self.max_instances is not None and self.n_instances >= self.max_instances:
             return False
-        instances = self.draw_batch(self.n_batches).to(self.device)
+        instances, n_instances, generator = self._draw_part()
         # In training mode and with gradients: the gradient pass uses this encoding too, so that batch normalization acts and
         # learns with the same statistics.
         self.policy.set_training_mode(True)
         size = self._micro_batches.size(self, len(instances))
         cache = self.policy.encode(instances) if size is None else encode_in_parts(self.policy, instances, size)
-        generator = self.action_generator(self.n_batches)
         actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
         with th.no_grad():
             returns = problem.returns(instances, actions)
-            require_finite_returns(self, returns)
+            require_finite_returns(self, distributed.gather(returns, n_instances))
             baseline = self._baseline.of_episodes(problem, instances, returns)
-        if not self._report_episodes(env, callback, episodes_by_sample(problem, instances, actions, returns)):
+        samples = episodes_of_all(episodes_by_sample(problem, instances, actions, returns), n_instances)
+        if not distributed.all_agree(self._report_episodes(env, callback, samples)):
             return False
         # In micro-batches each is encoded again, with gradients.
-        self._batch = EpisodeBatch(instances, cache if size is None else None, actions, returns, baseline, size)
+        self._batch = EpisodeBatch(instances, cache if size is None else None, actions, returns, baseline, size, n_instances)
         callback.on_rollout_end()
         return True
 
@@ -337,7 +364,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         problem = self.problem
         if problem is not None:
             self.n_batches += 1
-            self.n_instances += self.n_envs if batch is None else len(batch.instances)
+            self.n_instances += self.n_envs if batch is None else batch.n_instances
             self.logger.record("train/epoch", self.epoch)
             complete = self.n_instances // self.instances_per_epoch
             if complete > self.epoch:
@@ -365,6 +392,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         progress_bar: bool = False,
     ) -> SelfT:
         warn_of_ignored_settings(self)
+        callback, progress_bar = begin_together(self, callback, progress_bar)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def learn_instances(
