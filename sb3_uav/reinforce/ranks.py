@@ -51,6 +51,18 @@ def begin_together(model: Any, callback: MaybeCallback, progress_bar: bool) -> t
     return _without_reports(callback), False
 
 
+def require_shareable(model: Any) -> None:
+    """
+    :param model: An algorithm
+    :raises ValueError: If there are several processes, which can share the training of REINFORCE only
+    """
+    if distributed.world_size() > 1 and not hasattr(model, "n_batches"):
+        raise ValueError(
+            f"Several processes can only share the training of REINFORCE, found {type(model).__name__}; train it in a single "
+            "process, or set --algo reinforce."
+        )
+
+
 def _without_reports(callback: Any) -> Any:
     """:return: The callbacks but those that evaluate, write or report"""
     if isinstance(callback, CallbackList):

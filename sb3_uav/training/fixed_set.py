@@ -97,6 +97,8 @@ class FixedSetEvalCallback(BestPairOwner):
     :raises ValueError: If an argument is not allowed; the message names it
     """
 
+    # Of several processes, the first one evaluates; see sb3_uav.reinforce.ranks.
+    only_on_main_rank = True
     # Two callbacks with the same name here cannot share a folder.
     results_file: ClassVar[str] = RESULTS_FILE
     instances_file: ClassVar[str | None] = _INSTANCES_FILE

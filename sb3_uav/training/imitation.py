@@ -13,9 +13,8 @@ import numpy as np
 import torch as th
 from torch.nn import functional
 
+from sb3_uav.common import distributed
 from sb3_uav.common.divergence import LARGEST_WEIGHT, DivergenceError, first_bad, largest
-from sb3_uav.common.random_streams import torch_generator
-from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, training_batch
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule
@@ -24,6 +23,7 @@ from sb3_uav.local_search.search import LocalSearch
 from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.imitation_progress import ImitationProgress, Lesson
+from sb3_uav.training.subsets import sample_subsets
 
 # Number of tasks of a subset for which a batch holds exactly batch_size subsets; of larger subsets it holds fewer.
 _TYPICAL_SIZE = 30
@@ -56,6 +56,8 @@ def imitate(
 ) -> None:
     """
     Train a router on the tours of local search, by the likelihood of their moves.
+
+    Several processes (see :mod:`sb3_uav.common.distributed`) share the search and the gradients; all must see the folder.
 
     The subsets are sampled from the allocator, which may be untrained. Tours are reversed and rotated around the
     depot at random.
@@ -98,13 +100,17 @@ def imitate(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * min(1.0, update / _WARM_UP) * (_LAST_RATE + (1 - _LAST_RATE) * cosine)
         lesson = _varied(lessons[int(rng.integers(len(lessons)))], rng, batch_size)
-        lesson = Lesson(lesson.instances.to(router.device), lesson.tours.to(router.device))
+        n_new = int((lesson.tours > 0).sum())
+        rows = distributed.shard(len(lesson.tours))
+        lesson = Lesson(lesson.instances[rows].to(router.device), lesson.tours[rows].to(router.device))
         is_move = lesson.tours > 0
-        n_new = int(is_move.sum())
         log_prob = router.evaluate_episodes(lesson.instances, lesson.tours[:, None]).log_prob[:, 0]
-        loss = -log_prob[is_move].sum() / max(n_new, 1)
+        # A part of the mean over the moves of all processes; several of them may have the same few.
+        loss = -log_prob[is_move].sum() / max(distributed.total(int(is_move.sum())), 1)
         optimizer.zero_grad()
         loss.backward()
+        distributed.sum_gradients(list(router.parameters()))
+        loss = distributed.sum_with_gradient(loss.detach())
         norm = th.nn.utils.clip_grad_norm_(router.parameters(), _MAX_GRAD_NORM)
         _require_finite(update, progress, {"imitation loss": loss, "gradient norm of the imitation": norm})
         optimizer.step()
@@ -167,16 +173,15 @@ def _search_lessons(
     start = time.perf_counter()
     lessons = [] if progress is None else progress.restore_lessons(rng)
     n_found, n_saved = sum(len(lesson.tours) for lesson in lessons), len(lessons)
-    allocator.set_training_mode(False)
     while n_found < n_subsets:
         instances = allocator.arrange(training_batch(generator, max(batch_size // 2, 1), rng))
-        actions = torch_generator(rng, allocator.device)
-        assignment = allocator.decode_episodes(instances.to(allocator.device), deterministic=False, generator=actions)
-        subsets = split_tasks(instances, assignment.cpu()).instances
+        subsets = sample_subsets(allocator, instances, rng)
         n_rows = 2 * batch_size * _TYPICAL_SIZE // subsets.n_tasks
         subsets = subsets[rng.permutation(len(subsets))[: max(n_rows, 4)]]
         subsets = subsets.trim(max(int(subsets.task_mask.sum(1).max()), 1))
-        lessons.append(Lesson(subsets, good_tours(subsets)))
+        # Each process searches tours for its part of the subsets.
+        tours = distributed.gather(good_tours(subsets[distributed.shard(len(subsets))]), len(subsets))
+        lessons.append(Lesson(subsets, tours))
         before, n_found = n_found, n_found + len(subsets)
         if n_found // _CHUNK_SIZE > before // _CHUNK_SIZE or n_found >= n_subsets:
             report(f"imitation: {n_found} of {n_subsets} tours, {time.perf_counter() - start:.0f} s")

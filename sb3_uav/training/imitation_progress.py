@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_uav.common import distributed
 from sb3_uav.common.files import write_atomically
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import RouterPolicy
@@ -68,6 +69,8 @@ class ImitationProgress:
             except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
                 raise self._damaged(self._chunk_file(), error) from error
             self._n_chunks += 1
+        # The next file is not written before all processes have found that there is none.
+        distributed.barrier()
         return lessons
 
     def save_updates(
@@ -113,6 +116,8 @@ class ImitationProgress:
         return self.folder / f"lessons_{self._n_chunks}.pt"
 
     def _write(self, path: Path, rng: np.random.Generator, content: dict[str, Any]) -> None:
+        if not distributed.is_main():
+            return
         stream = io.BytesIO()
         th.save({"settings": self.settings, "rng": json.dumps(rng.bit_generator.state), **content}, stream)
         write_atomically(path, stream.getvalue())

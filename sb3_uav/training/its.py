@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import warnings
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_uav.common import distributed
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.divergence import DivergenceError
 from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, Moment, log_text
@@ -25,6 +25,7 @@ from sb3_uav.policies.freezing import Freezer
 from sb3_uav.pretrained.router_source import router_source
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.finite import watch
+from sb3_uav.reinforce.ranks import require_shareable
 from sb3_uav.reinforce.recognition import find_problem
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import RouterCallback, take_over
@@ -42,7 +43,7 @@ from sb3_uav.training.its_schedule import ALTERNATE, PRETRAINING, EpochSchedule,
 from sb3_uav.training.router_handover import hand_over_router
 from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
-from sb3_uav.training.run_folder import find_run_folder
+from sb3_uav.training.run_folder import folder_for_router
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_complete_run, warn_of_large_batches
 from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances, new_batches
 from sb3_uav.training.warm_start import WarmStart, bring_progress
@@ -172,11 +173,13 @@ class ITSCallback(RouterCallback):
                 f"{type(self.model.policy).__name__} on {self.training_env}; its VecEnv must be a BatchedVecEnv or a "
                 "DummyVecEnv (not --vec-env subproc) without wrappers."
             )
+        require_shareable(self.model)
+        self.verbose = self.verbose if distributed.is_main() else 0
         self.problem = problem
         watch(self.model)
         self.instances_per_epoch = find_epoch_size(self.model, self.instances_per_epoch)
         if self.save_path is None:
-            self.save_path = self._find_save_path()
+            self.save_path = folder_for_router(self)
         self._axis.begin(self.model)
         if self._started:
             self._axis.join(lambda: self.router)
@@ -257,14 +260,8 @@ class ITSCallback(RouterCallback):
             start()
         self._warm_started = True
         self._save_checkpoint()
-        if folder is not None:
+        if folder is not None and distributed.is_main():
             shutil.rmtree(folder, ignore_errors=True)
-
-    def _find_save_path(self) -> Path | None:
-        folder = find_run_folder(self)
-        if folder is None:
-            warnings.warn("ITSCallback saves no router: set save_path to a folder.", stacklevel=3)
-        return folder
 
     # ------------------------------------------------------------------------------------------------------ epochs
 
@@ -422,18 +419,18 @@ class ITSCallback(RouterCallback):
         self._axis.note()
         if self.verbose > 0:
             print(f"{level} epoch {epoch} ({phase}): mean objective {objective:.2f}, {record.seconds:.1f} s")
-        if self.save_path is not None:
+        if self.save_path is not None and distributed.is_main():
             write_atomically(self.save_path / LOG_FILE, log_text(self.records))
 
     def _save_router(self) -> None:
-        if self.save_path is not None:
+        if self.save_path is not None and distributed.is_main():
             self._trainer.save(self.save_path / ROUTER_FILE)
 
     def _save_checkpoint(self) -> None:
         """Write both levels' zips and the state of the strategy."""
         self._axis.note()
         self._save_router()
-        if self.save_path is not None:
+        if self.save_path is not None and distributed.is_main():
             folder, begun = self.save_path / CHECKPOINT_FOLDER, (self._warm_started, self._share, self._origin)
             write_checkpoint(folder, self.model, self.router, self.epoch, self.records, *begun, self.keep_checkpoints)
 
@@ -446,4 +443,6 @@ class ITSCallback(RouterCallback):
         self._warm_started = state.get("warm_started", True)
         self.records = [EpochRecord(**record) for record in state["records"]]
         self._trainer.load(folder / state["router"])
+        # Nothing is replaced there before all processes have read it.
+        distributed.barrier()
         return state.get("share")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common import distributed
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
@@ -52,8 +53,8 @@ class PretrainedRouterCallback(BaseCallback):
         with undisturbed_random_state():
             router = load_policy(self.router, self.model.device, RouterPolicy)
         hand_over_router(self, router.plan)
-        folder = self.save_path or find_run_folder(self)
-        if folder is not None:
+        folder = distributed.on_main(lambda: self.save_path or find_run_folder(self))
+        if folder is not None and distributed.is_main():
             write_atomically(folder / ROUTER_FILE, self.router.read_bytes())
 
     def _on_step(self) -> bool:

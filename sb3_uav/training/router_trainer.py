@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_uav.common import distributed
 from sb3_uav.common.divergence import note_saved
 from sb3_uav.common.epoch_log import EpisodeStatistics
 from sb3_uav.common.random_state import undisturbed_random_state
@@ -84,6 +85,8 @@ class RouterTrainer:
                 f"router: learning_rate is {kwargs['learning_rate']!r}; write a number. How many steps the router will "
                 "take is not known, so it has no schedule but lr_decay."
             )
+        if distributed.world_size() > 1 and not issubclass(algorithm, REINFORCE):
+            raise ValueError(f"router: algo is {algo!r}; several processes can only share the training of reinforce.")
         if issubclass(algorithm, REINFORCE):
             self._check_epoch(n_envs, kwargs.get("instances_per_epoch", epoch_size))
         whole = WholeInstances(generator)
@@ -98,6 +101,7 @@ class RouterTrainer:
             raise ValueError(f"router: these arguments do not fit algorithm {algo!r}: {error}") from error
         if not isinstance(self.policy, RouterPolicy):
             raise ValueError(f"router: policy must be a RouterPolicy, found {type(self.policy).__name__}.")
+        distributed.share_tensors(self.policy.state_dict().values())
         self._prepare()
         outputs = [f for f in allocator.logger.output_formats if isinstance(f, TensorBoardOutputFormat)]
         folder = str(Path(allocator.logger.dir) / "router") if outputs and allocator.logger.dir else None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import HumanOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_uav.common import distributed
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.training.best_pair import best_model_folder
@@ -36,6 +38,18 @@ def find_run_folder(callback: BaseCallback) -> Path | None:
     if logger.dir and any(not isinstance(output, HumanOutputFormat) for output in logger.output_formats):
         return Path(logger.dir)
     return None
+
+
+def folder_for_router(callback: BaseCallback) -> Path | None:
+    """
+    :param callback: An ``ITSCallback`` whose training has started, in all processes
+    :return: The folder of the run, as :func:`find_run_folder` finds it in the first of several processes; with a warning if
+        there is none
+    """
+    folder = distributed.on_main(lambda: find_run_folder(callback))
+    if folder is None:
+        warnings.warn(f"{type(callback).__name__} saves no router: set save_path to a folder.", stacklevel=4)
+    return folder
 
 
 def _monitor_folder(env: VecEnv) -> Path | None:

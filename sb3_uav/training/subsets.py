@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch as th
 
-from sb3_uav.common.random_streams import TRAINING_STREAM, random_stream, torch_generator
+from sb3_uav.common import distributed
+from sb3_uav.common.random_streams import TRAINING_STREAM, PartGenerator, random_stream, torch_generator
 from sb3_uav.envs.allocation import split_tasks
 from sb3_uav.envs.generators import InstanceGenerator, MixtureGenerator, goes_beyond_the_paper, training_batch
 from sb3_uav.envs.instances import Instances
@@ -17,6 +18,25 @@ from sb3_uav.policies import AllocatorPolicy
 
 # Number of test instances allocated at once: the smaller of the paper's batch sizes.
 _HELD_OUT_ROWS = 256
+
+
+def sample_subsets(allocator: AllocatorPolicy, instances: Instances, rng: np.random.Generator) -> Instances:
+    """
+    Allocate tasks by sampling; each process does so for its part of the instances, and all get the subsets of all.
+
+    :param allocator: The allocator, which is put into evaluation mode
+    :param instances: ``batch`` instances, tasks in the allocator's order
+    :param rng: Random generator
+    :return: ``batch * n_uavs`` single-UAV instances on the CPU
+    """
+    device = allocator.device
+    generator = torch_generator(rng, device)
+    allocator.set_training_mode(False)
+    rows, part = distributed.shard(len(instances)), instances
+    if distributed.world_size() > 1:
+        part, generator = instances[rows], PartGenerator.of(generator, rows, len(instances))
+    actions = allocator.decode_episodes(part.to(device), deterministic=False, generator=generator)
+    return split_tasks(instances, distributed.gather(actions.cpu(), len(instances))).instances
 
 
 class SingleUavGenerator:
@@ -131,11 +151,7 @@ class AllocatedSubsets(SingleUavGenerator):
         return subsets[kept]
 
     def _allocate(self, instances: Instances, rng: np.random.Generator) -> Instances:
-        device = self.allocator.device
-        generator = torch_generator(rng, device)
-        self.allocator.set_training_mode(False)
-        actions = self.allocator.decode_episodes(instances.to(device), deterministic=False, generator=generator)
-        return split_tasks(instances, actions.cpu()).instances
+        return sample_subsets(self.allocator, instances, rng)
 
     def held_out(self, batch_size: int, rng: np.random.Generator) -> Instances:
         """

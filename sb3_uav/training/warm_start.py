@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sb3_uav.common import distributed
 from sb3_uav.common.imports import import_object
 
 _IMITATION_PATH = "sb3_uav.training.imitation.imitate"
@@ -42,7 +43,7 @@ class WarmStart:
 
     def bind(self, positional: tuple[Any, ...], offered: dict[str, Any]) -> Callable[[], None]:
         """
-        :param positional: Positional arguments of the function
+        :param positional: Positional arguments of the function, the router's policy first
         :param offered: Arguments passed if the function has parameters of these names
         :return: A function that makes the call
         :raises ValueError: If there is no such function, or the arguments do not fit
@@ -59,7 +60,13 @@ class WarmStart:
             call = signature.bind(*positional, **{**known, **self.arguments})
         except TypeError as error:
             raise ValueError(f"warm_start: these arguments do not fit {self.path}: {error}") from error
-        return lambda: function(*call.args, **call.kwargs)
+
+        def start() -> None:
+            function(*call.args, **call.kwargs)
+            # A function of the user may know nothing of other processes.
+            distributed.share_tensors(positional[0].state_dict().values() if distributed.world_size() > 1 else ())
+
+        return start
 
 
 def bring_progress(folder: Path, earlier: Path | None) -> None:
@@ -69,9 +76,10 @@ def bring_progress(folder: Path, earlier: Path | None) -> None:
     :param folder: Folder of the warm start's progress
     :param earlier: The same folder of the checkpoint; None if there is no checkpoint
     """
-    if earlier is not None and earlier.resolve() == folder.resolve():
-        return
-    if folder.is_dir():
-        shutil.rmtree(folder)
-    if earlier is not None and earlier.is_dir():
-        shutil.copytree(earlier, folder)
+    is_there = earlier is not None and earlier.resolve() == folder.resolve()
+    if distributed.is_main() and not is_there:
+        if folder.is_dir():
+            shutil.rmtree(folder)
+        if earlier is not None and earlier.is_dir():
+            shutil.copytree(earlier, folder)
+    distributed.barrier()

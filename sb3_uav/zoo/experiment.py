@@ -15,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EventCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_uav.common import distributed
 from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
@@ -74,11 +75,26 @@ class UAVExperimentManager(ExperimentManager):
 
     def __init__(self, args: Any, *positional: Any, **kwargs: Any) -> None:
         super().__init__(args, *positional, **kwargs)
+        self._share()
         self._weights: Weights | None = None
         self._eval_env_kwargs_given = getattr(args, "eval_env_kwargs", None) is not None
         if kwargs.get("vec_env_type", "dummy") == "dummy":
             self.vec_env_class = make_batched_vec_env  # type: ignore[assignment]
         register_search_spaces(self.env_name.gym_id)
+
+    def _share(self) -> None:
+        """
+        Let all but the first of several processes be silent.
+
+        :raises ValueError: If several processes cannot share what it asks for
+        """
+        if distributed.world_size() > 1 and (self.algo != "reinforce" or self.optimize_hyperparameters):
+            found = "-optimize" if self.optimize_hyperparameters else f"--algo {self.algo}"
+            raise ValueError(
+                f"torchrun: several processes can only share --algo reinforce, found {found}; start a single one."
+            )
+        if not distributed.is_main():
+            self.verbose, self.tensorboard_log, self.show_progress = 0, None, False
 
     @property
     def _where(self) -> str:
@@ -141,10 +157,11 @@ class UAVExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         require_finite_model(model, self.save_path)
-        super().save_trained_model(model)
+        if distributed.is_main():
+            super().save_trained_model(model)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        env = super().create_envs(n_envs, eval_env, no_log)
+        env = super().create_envs(n_envs, eval_env, no_log or not distributed.is_main())
         if eval_env:
             env.seed(self.seed + EVALUATION_SEED)
         return env
@@ -206,6 +223,19 @@ class UAVExperimentManager(ExperimentManager):
             if isinstance(hyperparams.get(key), str):
                 hyperparams[key] = parse_schedule(key, hyperparams[key])
         return hyperparams
+
+    def create_log_folder(self) -> None:
+        # The first of several processes chooses and makes it.
+        self.save_path = distributed.on_main(self._make_log_folder)
+        self.params_path = f"{self.save_path}/{self.env_name}"
+
+    def _make_log_folder(self) -> str:
+        super().create_log_folder()
+        return self.save_path
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        if distributed.is_main():
+            super()._save_config(saved_hyperparams)
 
     def create_callbacks(self) -> None:
         super().create_callbacks()

@@ -9,8 +9,10 @@ from importlib import import_module
 from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
+from sb3_uav.common import distributed
 from sb3_uav.common.errors import main_function
 from sb3_uav.common.optional import require
+from sb3_uav.common.random_streams import draw_seed
 from sb3_uav.pretrained import names
 from sb3_uav.registration import ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
@@ -28,13 +30,30 @@ RoutePlanning-v0 with --env-kwargs, or what --gym-packages registers.
 
 def train(arguments: Sequence[str]) -> None:
     """
-    Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works.
+    Train or tune with rl_zoo3; every flag of ``rl_zoo3.train`` works. Under ``torchrun`` the processes share the training.
 
     :param arguments: Command line arguments
     :raises ValueError: If an argument or the YAML is wrong
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that training needs is not installed
     """
+    if not distributed.is_launched():
+        _train(arguments)
+        return
+    with distributed.process_group(), distributed.quiet_unless_main():
+        _train([*arguments, *_shared_seed(arguments)])
+
+
+def _shared_seed(arguments: Sequence[str]) -> list[str]:
+    """:return: A seed for all processes, as rl_zoo3 draws one in each of them, unless there is one among the arguments"""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--seed", type=int, default=-1)
+    given = parser.parse_known_args(arguments)[0].seed
+    return [] if given >= 0 else ["--seed", str(distributed.on_main(draw_seed))]
+
+
+def _train(arguments: Sequence[str]) -> None:
+    """:param arguments: Command line arguments"""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="reinforce")
     parser.add_argument("--env")
