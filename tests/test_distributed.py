@@ -1,11 +1,12 @@
 """Training shared by two processes: gradients, decisions and files as in a single one."""
 
-
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_uav.common import distributed
+from sb3_uav.common.random_streams import PartGenerator, exponential_noise
 from sb3_uav.envs.allocation import TaskAllocationEnv
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
@@ -41,7 +42,7 @@ class Gradients(BaseCallback):
 
     def __init__(self):
         super().__init__()
-        self.gradient = None
+        self.gradient, self.logged = None, {}
 
     def _on_step(self):
         return True
@@ -85,3 +86,112 @@ def test_two_ranks_give_the_gradient_of_one(tmp_path, level, preset, kind):
     assert first[3][:4] == expected[3][:4]
     for name in ("train/loss", "train/grad_norm", "train/policy_gradient_loss", "train/entropy_loss"):
         assert first[2][name] == pytest.approx(expected[2][name], rel=1e-4, abs=1e-6), name
+
+
+def test_noise_of_some_rows_is_that_of_the_whole_batch():
+    whole = exponential_noise(th.zeros(7, 2, 3), th.Generator().manual_seed(5))
+    rows = slice(2, 5)
+    part = PartGenerator.of(th.Generator().manual_seed(5), rows, 7)
+    th.testing.assert_close(exponential_noise(th.zeros(3, 2, 3), part), whole[rows], rtol=0, atol=0)
+
+
+def test_a_single_process_needs_no_others():
+    assert (distributed.world_size(), distributed.rank(), distributed.is_main()) == (1, 0, True)
+    rows = th.arange(6).view(3, 2)
+    assert distributed.gather(rows, 3) is rows
+    assert distributed.sum_with_gradient(rows) is rows
+    assert distributed.on_main(lambda: 5) == 5
+    assert distributed.all_agree(True) and not distributed.all_agree(False)
+
+
+def collectives(rank):
+    whole = th.arange(35).view(5, 7)
+    part = whole[distributed.shard(5)]
+    assert len(part) == 2 + rank
+    # The last dimension differs, as that of tours does.
+    th.testing.assert_close(distributed.gather(part[:, : 5 + 2 * rank].clone(), 5)[2:], whole[2:])
+    assert distributed.gather(part > 3, 5).dtype == th.bool
+    # One row for two ranks: both have it.
+    assert distributed.shard(1) == slice(0, 1) and len(distributed.gather(whole[:1], 1)) == 1
+    assert distributed.total(rank + 1) == 3
+    assert not distributed.all_agree(rank == 0)
+    assert distributed.broadcast(f"rank {rank}") == "rank 0"
+    messages = []
+    for call in (lambda: distributed.on_main(lambda: 1 // 0), lambda: distributed.require_equal("seed", rank)):
+        try:
+            call()
+        except (ValueError, ZeroDivisionError) as error:
+            messages.append(str(error))
+    weight = th.nn.Parameter(th.ones(2))
+    unused = th.nn.Parameter(th.ones(3))
+    half = th.nn.Parameter(th.ones(1))
+    weight.grad = th.full((2,), float(rank + 1))
+    if rank == 1:
+        half.grad = th.full((1,), 7.0)
+    distributed.sum_gradients([weight, unused, half])
+    assert weight.grad.tolist() == [3.0, 3.0] and unused.grad is None and half.grad.tolist() == [7.0]
+    return messages
+
+
+def test_collective_operations(tmp_path):
+    first, second = run_ranks(2, tmp_path, collectives)
+    assert first[0] == second[0] and "by zero" in first[0]
+    assert first[1].startswith("The processes of this run differ in seed (rank 0: 0, rank 0: 0)")
+    assert "rank 1: 1, rank 0: 0" in second[1]
+
+
+@pytest.mark.parametrize("before, after", [(1, 2), (2, 1)])
+def test_any_number_of_ranks_goes_on_with_a_checkpoint(tmp_path, before, after):
+    path = tmp_path / "model.zip"
+
+    def first_half(rank):
+        model = make("router", "paper")
+        train(model, 2)
+        if rank == 0:
+            model.save(path)
+
+    def second_half(rank):
+        return train(REINFORCE.load(path, make("router").env, device="cpu"), 2)
+
+    def run(n, name, function):
+        return function(0) if n == 1 else run_ranks(n, tmp_path / name, function)[0]
+
+    run(before, "first", first_half)
+    _, parameters, _, counters = run(after, "second", second_half)
+    whole = train(make("router", "paper"), 4)
+    for name, values in parameters.items():
+        np.testing.assert_allclose(values, whole[1][name], atol=1e-4, err_msg=name)
+    assert counters[:4] == whole[3][:4]
+
+
+def test_a_batch_smaller_than_the_number_of_ranks(tmp_path):
+    expected = train(make(n_envs=1))
+    first, second = run_ranks(2, tmp_path, lambda _: train(make(n_envs=1)))
+    np.testing.assert_allclose(first[0], expected[0], rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(first[0], second[0])
+
+
+def test_ranks_that_differ_are_told_so(tmp_path):
+    first, second = run_ranks(2, tmp_path, lambda rank: train(make(n_envs=5 + rank)))
+    for error in (first, second):
+        assert isinstance(error, ValueError) and "differ in settings or progress" in str(error)
+
+
+def test_not_finite_on_one_rank_stops_both(tmp_path):
+    def spoiled(rank):
+        model = make()
+        play = model.problem.returns
+        # Instead of the returns of the second rank alone.
+        type(model.problem).returns = lambda self, *args: play(*args) * (float("nan") if rank == 1 else 1.0)
+        return train(model)
+
+    for error in run_ranks(2, tmp_path, spoiled):
+        assert isinstance(error, ValueError) and "nan" in str(error)
+
+
+def test_step_loop_is_refused(tmp_path):
+    def cart_pole(_):
+        REINFORCE("MlpPolicy", "CartPole-v1", device="cpu").learn(10)
+
+    for error in run_ranks(2, tmp_path, cart_pole):
+        assert isinstance(error, ValueError) and "can only share whole episodes" in str(error)
