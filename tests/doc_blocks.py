@@ -68,6 +68,7 @@ class NotRun(NamedTuple):
 NOT_RUN = [
     NotRun("README.md", r"pip install -c", "it installs packages into the environment of the tests"),
     NotRun("CONTRIBUTING.md", r"make install", "it creates an environment and installs packages"),
+    NotRun("docs/distributed.md", r"OMP_NUM_THREADS=1 torchrun --nnodes 2", "it waits for a second machine"),
 ]
 
 _NETWORK = dict(embed_dim=8, n_layers=1, n_heads=2, ff_dim=8)
@@ -103,6 +104,7 @@ RULES = [
     Rule("docs/fine_tuning.md", r"--epochs 29", "--epochs 1 --instances-per-epoch 16 --held-out 3"),
     Rule("docs/fine_tuning.md", r"--held-out 96", "--held-out 4"),
     Rule("docs/fine_tuning.md", r"(sb3-uav train .*) -i", rf"\1 {_SMALL.format('reinforce')} -i"),
+    Rule("docs/distributed.md", r"(--env TaskAllocation-U4-N80-v0)", rf"\1 {_SMALL.format('reinforce')}"),
     # The files beside the tests have other names.
     Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
     Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),

@@ -109,7 +109,7 @@ def collectives(rank):
     part = whole[distributed.shard(5)]
     assert len(part) == 2 + rank
     # The last dimension differs, as that of tours does.
-    th.testing.assert_close(distributed.gather(part[:, : 5 + 2 * rank].clone(), 5)[2:], whole[2:])
+    th.testing.assert_close(distributed.gather(part[:, : 5 + 2 * rank], 5, ragged=True)[2:], whole[2:])
     assert distributed.gather(part > 3, 5).dtype == th.bool
     # One row for two ranks: both have it.
     assert distributed.shard(1) == slice(0, 1) and len(distributed.gather(whole[:1], 1)) == 1

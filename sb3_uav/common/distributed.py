@@ -169,32 +169,30 @@ def shard(n: int) -> slice:
     return slice(rank() * n // size, (rank() + 1) * n // size)
 
 
-def gather(part: th.Tensor, n: int) -> th.Tensor:
+def gather(part: th.Tensor, n: int, ragged: bool = False) -> th.Tensor:
     """
     :param part: ``(n_rows, ...)``, the rows of this rank
     :param n: Number of rows of the whole task, of which each rank has its :func:`shard`
-    :return: ``(n, ...)``, on the device of ``part``. Further dimensions must agree, but for the last one, which is padded
-        with 0 to the longest
+    :param ragged: Whether the last dimension may differ between ranks; it is padded with 0 to the longest
+    :return: ``(n, ...)``, on the device of ``part``
     """
     size = world_size()
     if size == 1 or n < size:
         return part
-    home = part.device
-    # A tensor of shape () for each number: rows and, of matrices, columns.
-    longest = th.tensor([len(part), part.shape[-1] if part.dim() > 1 else 0], dtype=th.int64, device="cpu")
-    dist.all_reduce(longest, dist.ReduceOp.MAX)
-    n_rows, n_columns = (int(number) for number in longest)
-    padded = part.detach().cpu()
-    if padded.dim() > 1 and padded.shape[-1] < n_columns:
-        padded = th.nn.functional.pad(padded, (0, n_columns - padded.shape[-1]))
-    if len(padded) < n_rows:
-        padded = th.cat([padded, padded[:1].expand(n_rows - len(padded), *padded.shape[1:])])
+    sent = part.detach().cpu()
+    if ragged:
+        longest = th.tensor(sent.shape[-1], dtype=th.int64, device="cpu")
+        dist.all_reduce(longest, dist.ReduceOp.MAX)
+        sent = th.nn.functional.pad(sent, (0, int(longest) - sent.shape[-1]))
+    # All ranks must send alike, and some have one row fewer.
+    missing = -(-n // size) - len(sent)
+    sent = th.cat([sent, sent[:1].expand(missing, *sent.shape[1:])])
     # Booleans are no numbers for gloo.
-    sent = padded.to(th.uint8) if padded.dtype == th.bool else padded
-    parts = [th.empty_like(sent, memory_format=th.contiguous_format) for _ in range(size)]
-    dist.all_gather(parts, sent.contiguous())
+    sent = (sent.to(th.uint8) if sent.dtype == th.bool else sent).contiguous()
+    parts = [th.empty_like(sent) for _ in range(size)]
+    dist.all_gather(parts, sent)
     lengths = [(other + 1) * n // size - other * n // size for other in range(size)]
-    return th.cat([rows[:length] for rows, length in zip(parts, lengths, strict=True)]).to(home, part.dtype)
+    return th.cat([rows[:length] for rows, length in zip(parts, lengths, strict=True)]).to(part.device, part.dtype)
 
 
 def total(number: float) -> float:
@@ -202,11 +200,19 @@ def total(number: float) -> float:
     :param number: A number of this rank
     :return: The sum over all ranks
     """
+    return totals(number)[0]
+
+
+def totals(*numbers: float) -> list[float]:
+    """
+    :param numbers: Numbers of this rank
+    :return: The sum of each over all ranks
+    """
     if world_size() == 1:
-        return number
-    summed = th.tensor([number], dtype=th.float64, device="cpu")
+        return list(numbers)
+    summed = th.tensor(numbers, dtype=th.float64, device="cpu")
     dist.all_reduce(summed)
-    return float(summed)
+    return summed.tolist()
 
 
 def all_agree(condition: bool) -> bool:

@@ -134,10 +134,15 @@ def episodes_of_all(samples: list[PlayedEpisodes], n_instances: int) -> list[Pla
     if distributed.world_size() == 1:
         return samples
 
-    def gathered(field: np.ndarray | None) -> Any:
-        return None if field is None else distributed.gather(th.as_tensor(field, device="cpu"), n_instances).numpy()
-
-    return [PlayedEpisodes(*(gathered(field) for field in played)) for played in samples]
+    first = samples[0]
+    # One message for everything; float64 holds all of it exactly.
+    fields = [field for played in samples for field in played if field is not None]
+    columns = distributed.gather(th.as_tensor(np.stack(fields, 1), dtype=th.float64, device="cpu"), n_instances).numpy().T
+    per_sample = columns.reshape(len(samples), -1, n_instances)
+    return [
+        PlayedEpisodes(*(column.astype(kind.dtype) for column, kind in zip(fields, first, strict=False) if kind is not None))
+        for fields in per_sample
+    ]
 
 
 def steps_of_episodes(played: PlayedEpisodes, n_steps: int) -> Iterator[Step]:

@@ -69,7 +69,9 @@ def _summed_over_ranks(parts: LossParts) -> LossParts:
     """:return: The parts of the loss of all processes, so that all of them decide alike whether it is finite"""
     if distributed.world_size() == 1:
         return parts
-    return LossParts(*(None if part is None else th.as_tensor(distributed.total(part.item())) for part in parts))  # type: ignore[arg-type]
+    loss, policy, entropy, *value = distributed.totals(*(part.item() for part in parts if part is not None))
+    made = [th.tensor(number, dtype=th.float32, device="cpu") for number in (loss, policy, entropy, *value)]
+    return LossParts(made[0], made[1], made[2], made[3] if value else None)
 
 
 @th.no_grad()

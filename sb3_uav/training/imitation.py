@@ -180,7 +180,7 @@ def _search_lessons(
         subsets = subsets[rng.permutation(len(subsets))[: max(n_rows, 4)]]
         subsets = subsets.trim(max(int(subsets.task_mask.sum(1).max()), 1))
         # Each process searches tours for its part of the subsets.
-        tours = distributed.gather(good_tours(subsets[distributed.shard(len(subsets))]), len(subsets))
+        tours = distributed.gather(good_tours(subsets[distributed.shard(len(subsets))]), len(subsets), ragged=True)
         lessons.append(Lesson(subsets, tours))
         before, n_found = n_found, n_found + len(subsets)
         if n_found // _CHUNK_SIZE > before // _CHUNK_SIZE or n_found >= n_subsets:
