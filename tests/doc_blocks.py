@@ -104,7 +104,11 @@ RULES = [
     Rule("docs/fine_tuning.md", r"--epochs 29", "--epochs 1 --instances-per-epoch 16 --held-out 3"),
     Rule("docs/fine_tuning.md", r"--held-out 96", "--held-out 4"),
     Rule("docs/fine_tuning.md", r"(sb3-uav train .*) -i", rf"\1 {_SMALL.format('reinforce')} -i"),
-    Rule("docs/distributed.md", r"(--env TaskAllocation-U4-N80-v0)", rf"\1 {_SMALL.format('reinforce')}"),
+    Rule(
+        "docs/distributed.md",
+        r"(--env TaskAllocation-U4-N80-v0)",
+        r"\1 --conf-file small/reinforce.yml -n 320 --num-threads 1",
+    ),
     # The files beside the tests have other names.
     Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
     Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),
