@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -16,6 +17,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_uav.common import distributed
+from sb3_uav.common.random_streams import PartGenerator
+from sb3_uav.envs.instances import Instances
 from sb3_uav.reinforce.drivers import why_step_loop
 
 # Name of a class attribute of callbacks that evaluate, write or report, and so belong to rank 0.
@@ -49,6 +52,20 @@ def begin_together(model: Any, callback: MaybeCallback, progress_bar: bool) -> t
         return callback, progress_bar
     model.set_logger(Logger(None, []))
     return _without_reports(callback), False
+
+
+def part_of_batch(model: Any) -> tuple[Instances, int, th.Generator]:
+    """
+    :param model: A REINFORCE algorithm
+    :return: The instances of the next update that this process plays, their number in all processes, and the generator of
+        their actions
+    """
+    instances, generator = model.draw_batch(model.n_batches), model.action_generator(model.n_batches)
+    n_instances = len(instances)
+    if distributed.world_size() == 1:
+        return instances.to(model.device), n_instances, generator
+    rows = distributed.shard(n_instances)
+    return instances[rows].to(model.device), n_instances, PartGenerator.of(generator, rows, n_instances)
 
 
 def require_shareable(model: Any) -> None:

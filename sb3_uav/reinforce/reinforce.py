@@ -26,14 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_uav.common import distributed
 from sb3_uav.common.divergence import report_weights
-from sb3_uav.common.random_streams import (
-    ACTION_STREAM,
-    TRAINING_STREAM,
-    PartGenerator,
-    draw_seed,
-    random_stream,
-    torch_generator,
-)
+from sb3_uav.common.random_streams import ACTION_STREAM, TRAINING_STREAM, draw_seed, random_stream, torch_generator
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.generators import training_batch
 from sb3_uav.envs.instances import Instances
@@ -55,7 +48,7 @@ from sb3_uav.reinforce.gradients import accumulate_gradients
 from sb3_uav.reinforce.masked_steps import MaskedStepLoop
 from sb3_uav.reinforce.micro_batches import MicroBatches, encode_in_parts
 from sb3_uav.reinforce.monitor_rows import log_episodes
-from sb3_uav.reinforce.ranks import begin_together
+from sb3_uav.reinforce.ranks import begin_together, part_of_batch
 from sb3_uav.reinforce.recognition import find_problem
 
 SelfT = TypeVar("SelfT", bound="REINFORCE")
@@ -268,15 +261,6 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         """
         return torch_generator(random_stream(self.stream_seed, ACTION_STREAM, counter), self.device)
 
-    def _draw_part(self) -> tuple[Instances, int, th.Generator]:
-        """:return: Instances of the next update that this process plays, their number in all, and the actions' generator"""
-        instances, generator = self.draw_batch(self.n_batches), self.action_generator(self.n_batches)
-        n_instances = len(instances)
-        if distributed.world_size() == 1:
-            return instances.to(self.device), n_instances, generator
-        rows = distributed.shard(n_instances)
-        return instances[rows].to(self.device), n_instances, PartGenerator.of(generator, rows, n_instances)
-
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
@@ -305,7 +289,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         callback.on_rollout_start()
         if self.max_instances is not None and self.n_instances >= self.max_instances:
             return False
-        instances, n_instances, generator = self._draw_part()
+        instances, n_instances, generator = part_of_batch(self)
         # In training mode and with gradients: the gradient pass uses this encoding too, so that batch normalization acts and
         # learns with the same statistics.
         self.policy.set_training_mode(True)
