@@ -275,7 +275,7 @@ def test_weights_that_explode_are_reported_once():
 
 
 def test_a_weight_that_overflows_stops_and_is_not_saved(tmp_path):
-    network = dict(SMALL, optimizer_class=th.optim.SGD)
+    network = dict(SMALL, optimizer_class=th.optim.SGD, optimizer_kwargs={})
     model = make_model("router", learning_rate=1e34, max_grad_norm=1e9, normalize_advantage=True, policy_kwargs=network)
     next(model.policy.parameters()).register_hook(lambda gradient: gradient + 1e8)
     with pytest.raises(DivergenceError, match=r"^router: The weight .* is inf in update 1.*no file holds these weights"):

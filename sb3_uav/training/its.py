@@ -45,7 +45,7 @@ from sb3_uav.training.router_progress import router_progress
 from sb3_uav.training.router_trainer import RouterTrainer
 from sb3_uav.training.run_folder import folder_for_router
 from sb3_uav.training.run_size import find_epoch_size, share_of_plan, warn_of_complete_run, warn_of_large_batches
-from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances, new_batches
+from sb3_uav.training.subsets import AllocatedSubsets, WholeInstances, new_batch
 from sb3_uav.training.warm_start import WarmStart, bring_progress
 
 ROUTER_FILE = "router.zip"
@@ -320,8 +320,7 @@ class ITSCallback(RouterCallback):
             # Resumed between two epochs of the same batch.
             objective = next((r.objective for r in reversed(self.records) if r.level == "allocator"), objective)
         self._record("allocator", self.epoch, phase, end - self._instances_at_start, objective, self._epoch_start)
-        n_epochs = self.schedule.router_epochs_after(self.epoch)
-        if n_epochs > 0:
+        if (n_epochs := self.schedule.router_epochs_after(self.epoch)) > 0:
             self._train_on_subsets(n_epochs, 1 / self.problem.generator.n_uavs if phase == ALTERNATE else 1.0, phase)
         if self.epoch % self.checkpoint_freq == 0 or self.epoch == self.n_epochs:
             self._save_checkpoint()
@@ -332,14 +331,12 @@ class ITSCallback(RouterCallback):
     def _train_on_subsets(self, n_epochs: int, fraction: float, phase: str) -> None:
         assert isinstance(self.model.policy, AllocatorPolicy)
         n_batches = getattr(self.model, "n_batches", 0) - self._epoch_first_batch
-        draw_batch: Any
         if isinstance(self.model, REINFORCE):
             first, draw_batch = self._epoch_first_batch, self.model.draw_batch
         else:
             # SB3's algorithms cannot replay their instances; draw new ones from the same distribution.
-            n_envs = self.training_env.num_envs
-            first, n_batches = 0, -(-(self.instances_per_epoch or 0) // n_envs)
-            draw_batch = new_batches(self.model.policy, self.problem.generator, n_envs, self._seed(), self.epoch)
+            first, draw_batch = 0, self._draw_new_batch
+            n_batches = -(-(self.instances_per_epoch or 0) // self.training_env.num_envs)
         self._subsets = AllocatedSubsets(
             self.model.policy,
             self.problem.generator,
@@ -356,6 +353,10 @@ class ITSCallback(RouterCallback):
         finally:
             self._trainer.freezer.freeze()
             self._allocator_freezer.thaw()
+
+    def _draw_new_batch(self, index: int) -> Any:
+        n_envs, seed = self.training_env.num_envs, self._seed()
+        return new_batch(self.model.policy, self.problem.generator, n_envs, seed, self.epoch, index)
 
     def _seed(self) -> int:
         # Of the streams for warm start and router instances, saved in the allocator's zips.

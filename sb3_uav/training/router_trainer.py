@@ -66,6 +66,9 @@ class RouterTrainer:
         self.settings = settings
         self.epoch_size = epoch_size
         kwargs = dict(settings)
+        if isinstance(kwargs.get("policy_kwargs"), dict):
+            # A2C writes its optimizer into it, and in a YAML both levels may share one mapping.
+            kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])
         algo = kwargs.pop("algo", "reinforce")
         n_envs = kwargs.pop("n_envs", min(n_envs, epoch_size))
         algorithm = resolve_algorithm(algo)

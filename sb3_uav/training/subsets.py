@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -166,20 +167,16 @@ class AllocatedSubsets(SingleUavGenerator):
         return subsets[rng.permutation(len(subsets))[:batch_size]]
 
 
-def new_batches(
-    allocator: AllocatorPolicy, generator: InstanceGenerator, n_envs: int, seed: int, epoch: int
-) -> Callable[[int], Instances]:
+def new_batch(allocator: Any, generator: InstanceGenerator, n_envs: int, seed: int, epoch: int, index: int) -> Instances:
     """
+    Instances that no training has seen, for algorithms that cannot replay their own.
+
     :param allocator: The policy of the allocator
     :param generator: Draws the instances
     :param n_envs: Number of instances of a batch
     :param seed: Seed of the random streams
     :param epoch: Epoch of the allocator
-    :return: A function of the number of a batch, which draws instances that no training has seen
+    :param index: Number of the batch in this epoch
+    :return: The instances, the same at every call
     """
-
-    def draw(index: int) -> Instances:
-        rng = random_stream(seed, TRAINING_STREAM, epoch, index)
-        return allocator.arrange(training_batch(generator, n_envs, rng))
-
-    return draw
+    return allocator.arrange(training_batch(generator, n_envs, random_stream(seed, TRAINING_STREAM, epoch, index)))
