@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import json
 import os
-import pickle
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, overload
@@ -16,9 +11,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
+from sb3_uav.common.checked_zip import MIB, CheckedZip, ZipDamageError
+from sb3_uav.common.plain_json import read_plain_json
+from sb3_uav.common.tensor_file import MAX_TENSOR_BYTES, read_tensor_file
 from sb3_uav.policies.allocator import AllocatorPolicy
 from sb3_uav.policies.base import EpisodicPolicy
 from sb3_uav.policies.router import RouterPolicy
+from sb3_uav.policies.stored_shapes import check_settings, check_shapes
 
 PolicyT = TypeVar("PolicyT", bound=EpisodicPolicy)
 
@@ -30,6 +29,9 @@ _SIGNATURES: dict[str, type[EpisodicPolicy]] = {
 }
 # Stock A2C adds its optimizer class, which JSON cannot hold, to policy_kwargs; acting needs no optimizer.
 _IGNORED_KWARGS = {":type:", ":serialized:", "optimizer_class", "optimizer_kwargs"}
+# Largest size of the JSON: pickles of the last observations of 512 environments take 4 MB in it.
+MAX_DATA = 16 * MIB
+_MAX_MEMBERS, _MAX_TOTAL = 100, 512 * MIB
 
 
 class NotOurPolicyError(ValueError):
@@ -149,12 +151,31 @@ def read_policy(path: str | os.PathLike[str], expected: type[EpisodicPolicy] | N
             f"{file}: holds the policy of class {policy_class.__name__}, but {expected.__name__} is needed here; "
             "have the allocator's and the router's zip been exchanged?"
         )
+    _check_stock_code(data, file)
+    stored = StoredPolicy(file, policy_class, parameters, data)
+    try:
+        _check_fit(stored, stored.policy_kwargs)
+    except NotOurPolicyError:
+        # Its arguments cannot be had without a pickle, so that nobody can build it from here either.
+        pass
     for name, parameter in parameters.items():
         if not th.isfinite(parameter).all():
             found = parameter[~th.isfinite(parameter)].flatten()[0].item()
             raise ValueError(f"{file}: parameter '{name}' holds {found}; the training diverged, use an earlier checkpoint.")
-    _check_stock_code(data, file)
-    return StoredPolicy(file, policy_class, parameters, data)
+    return stored
+
+
+def _check_fit(stored: StoredPolicy, policy_kwargs: dict[str, Any]) -> None:
+    """
+    :param stored: A stored policy
+    :param policy_kwargs: Its arguments
+    :raises ValueError: If they do not fit its parameters; nothing of the size that they claim is allocated
+    """
+    try:
+        check_settings(policy_kwargs, len(stored.parameters))
+        check_shapes(stored.policy_class, policy_kwargs, stored.parameters)
+    except (ValueError, TypeError, AssertionError, RuntimeError, OverflowError, LookupError, AttributeError) as error:
+        raise misfit(stored, policy_kwargs, error) from error
 
 
 def misfit(stored: StoredPolicy, policy_kwargs: dict[str, Any], error: Exception) -> ValueError:
@@ -166,7 +187,7 @@ def misfit(stored: StoredPolicy, policy_kwargs: dict[str, Any], error: Exception
     """
     reason = " ".join(str(error).split())
     return ValueError(
-        f"{stored.file}: parameters and policy_kwargs {policy_kwargs} do not fit together ({reason:.300}); "
+        f"{stored.file}: parameters and policy_kwargs {policy_kwargs!s:.500} do not fit together ({reason:.300}); "
         "the zip was edited, or was written by another version of sb3_uav."
     )
 
@@ -189,34 +210,56 @@ def _read_zip(file: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     :return: The attributes of the algorithm as its JSON holds them, and the state dict of its policy on the CPU
     :raises ValueError: If the file is not one
     """
+    text, tensors = read_members(file, {"data": MAX_DATA, "policy.pth": MAX_TENSOR_BYTES}).values()
     try:
-        with zipfile.ZipFile(file) as archive:
-            # Of a truncated SB3 zip, zipfile may open a zip of tensors that lies inside, and take the rest for a preamble.
-            if min((member.header_offset for member in archive.infolist()), default=0) > 0:
-                raise zipfile.BadZipFile("its table of contents is missing")
-            missing = {"data", "policy.pth"} - set(archive.namelist())
+        data = read_plain_json(text)
+    except ValueError as error:
+        raise ValueError(f"{file}: 'data' in it cannot be read safely ({error!s:.200}); save it again.") from error
+    parameters = read_state(file, "policy.pth", tensors)
+    whole = isinstance(parameters, dict) and all(
+        isinstance(name, str) and isinstance(value, th.Tensor) for name, value in parameters.items()
+    )
+    if not whole or not isinstance(data, dict):
+        raise ValueError(f"{file}: 'policy.pth' must hold named tensors and 'data' an object; save it again with SB3.")
+    return data, parameters
+
+
+def read_members(file: Path, wanted: dict[str, int], optional: frozenset[str] = frozenset()) -> dict[str, bytes]:
+    """
+    :param file: An SB3 zip
+    :param wanted: Names of members, with the largest size of each
+    :param optional: Those that may be missing
+    :return: Their contents by name
+    :raises ValueError: If the file is not one, or not harmless
+    """
+    try:
+        with CheckedZip(file, _MAX_MEMBERS, _MAX_TOTAL) as archive:
+            missing = wanted.keys() - optional - archive.members.keys()
             if missing:
                 raise ValueError(
                     f"{file}: is not the zip of an SB3 algorithm ({sorted(missing)} missing in it); "
                     "give a zip that was written by model.save()."
                 )
-            text, tensors = archive.read("data"), archive.read("policy.pth")
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+            return {name: archive.read(name, most) for name, most in wanted.items() if name in archive.members}
+    except (ZipDamageError, OSError) as error:
         raise ValueError(
             f"{file}: is not an intact zip ({error}); it is damaged or incomplete, save or copy it again."
         ) from error
+
+
+def read_state(file: Path, member: str, content: bytes) -> Any:
+    """
+    :param file: An SB3 zip, named in errors
+    :param member: Name of a member that ``th.save`` has written
+    :param content: Its content
+    :return: Plain data and dense tensors
+    :raises ValueError: If it holds something else
+    """
     try:
-        data = json.loads(text)
-        parameters = th.load(io.BytesIO(tensors), map_location="cpu", weights_only=True)
-    except (ValueError, RuntimeError, EOFError, LookupError, TypeError, AttributeError, pickle.UnpicklingError) as error:
+        return read_tensor_file(content)
+    except ValueError as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(
-            f"{file}: 'data' or 'policy.pth' in it cannot be read safely ({reason:.200}); save it again."
-        ) from error
-    whole = isinstance(parameters, dict) and all(isinstance(value, th.Tensor) for value in parameters.values())
-    if not whole or not isinstance(data, dict):
-        raise ValueError(f"{file}: 'policy.pth' must hold named tensors and 'data' an object; save it again with SB3.")
-    return data, parameters
+        raise ValueError(f"{file}: '{member}' in it cannot be read safely ({reason:.300}); save it again.") from error
 
 
 def _plain_policy_kwargs(data: dict[str, Any], file: Path) -> dict[str, Any]:

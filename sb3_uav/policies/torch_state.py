@@ -4,10 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import torch as th
 from torch import nn
+
+_SHAPES_ONLY = ContextVar("shapes_only", default=False)
+
+
+@contextmanager
+def shapes_only() -> Iterator[None]:
+    """Build what :func:`float32_on_cpu` builds on the device ``meta``, where tensors have shapes but no memory."""
+    token = _SHAPES_ONLY.set(True)
+    try:
+        yield
+    finally:
+        _SHAPES_ONLY.reset(token)
 
 
 @contextmanager
@@ -17,7 +30,7 @@ def float32_on_cpu() -> Iterator[None]:
     if dtype != th.float32:
         th.set_default_dtype(th.float32)
     try:
-        with th.device("cpu"):
+        with th.device("meta" if _SHAPES_ONLY.get() else "cpu"):
             yield
     finally:
         if dtype != th.float32:

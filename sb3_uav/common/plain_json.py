@@ -1,0 +1,36 @@
+"""JSON of strangers: how much it holds is known before it is parsed."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+# Values of one text, and how deep they may lie. SB3's texts have a few hundred values, four deep.
+MAX_VALUES, MAX_DEPTH = 200_000, 64
+_STRING = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
+_LONG_NUMBER = re.compile(rb"[-+.0-9eE]{100}")
+
+
+def read_plain_json(text: bytes) -> Any:
+    """
+    :param text: JSON
+    :return: What it holds
+    :raises ValueError: If it is not JSON, or holds more or deeper values than anything of ours
+    """
+    # The pickles that SB3 writes are strings, which may be long.
+    marks = _STRING.sub(b"", text)
+    n_values = sum(marks.count(mark) for mark in (b",", b":", b"[", b"{"))
+    if n_values > MAX_VALUES:
+        raise ValueError(f"it holds {n_values} values, more than the {MAX_VALUES} that are read")
+    depth = 0
+    for mark in re.findall(rb"[\[{\]}]", marks):
+        depth += 1 if mark in b"[{" else -1
+        if depth > MAX_DEPTH:
+            raise ValueError(f"its values are nested more than {MAX_DEPTH} deep")
+    if _LONG_NUMBER.search(marks):
+        raise ValueError("it holds a number of 100 digits or more")
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("its values are nested too deeply") from error
