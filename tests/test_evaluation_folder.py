@@ -198,7 +198,7 @@ def test_cells_that_cannot_be(column: str, value: str, instances: Instances, tmp
     header, first, *others = (tmp_path / "results.csv").read_text().splitlines()
     cells = dict(zip(header.split(","), first.split(","), strict=True)) | {column: value}
     (tmp_path / "results.csv").write_text("\n".join([header, ",".join(cells.values()), *others]) + "\n")
-    with pytest.raises(ValueError, match=rf"results.csv(, line 2: is damaged .*{value}|: holds results of 'unknown')"):
+    with pytest.raises(ValueError, match=rf"results.csv, line 2: (is damaged .*{value}|holds results of 'unknown')"):
         evaluate([Stub()], instances, tmp_path, resume=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,9 @@ from sb3_uav.cli.solver_specs import add_run_options, solvers_of
 from sb3_uav.common.optional import install_command, require
 
 if TYPE_CHECKING:
+    from sb3_uav.evaluation.benchmarks.collection import BenchmarkFolder
     from sb3_uav.evaluation.benchmarks.gaps import GapRow
+    from sb3_uav.evaluation.shard import Shard
     from sb3_uav.solvers import Solver
 
 _OK, _INFEASIBLE, _FAILED = 0, 1, 3
@@ -36,6 +38,7 @@ files in DIR:
   anytime.png                     gap against time, with several time limits
   results.csv, schedules.jsonl, evaluation.json, summary.csv, summary.json   as of `sb3-uav evaluate`
   Rerun the same command to resume an interrupted run; further runs add solvers, time limits and seeds.
+  With --shard I/N, DIR covers part I of N of every set; `sb3-uav merge DIR... --out DIR` joins the parts.
 
 exit code:
   0    all schedules are feasible
@@ -125,9 +128,16 @@ class _Progress:
             self._bar.update(self._n_before + n_done - self._bar.n)
 
 
-def _n_results(solvers: Sequence[Solver], n_instances: int, time_limits: Sequence[float | None]) -> int:
+def _n_results(
+    solvers: Sequence[Solver], benchmark: BenchmarkFolder, time_limits: Sequence[float | None], shard: Shard
+) -> int:
     """:return: How many results a run has"""
-    return n_instances * sum(len(time_limits) if solver.uses_time_limit else 1 for solver in solvers)
+    from sb3_uav.evaluation.benchmarks.collection import evaluation_sets
+
+    sets = evaluation_sets(list(benchmark.instances.values()))
+    return sum(len(shard.rows(len(members))) for members in sets.values()) * sum(
+        len(time_limits) if solver.uses_time_limit else 1 for solver in solvers
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -139,10 +149,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises ImportError: If a package that the run needs is not installed
     """
     args = _make_parser().parse_args(argv)
+    from sb3_uav.cli.shards import run_shard
     from sb3_uav.evaluation.benchmarks import read_best_known, read_folder
-    from sb3_uav.evaluation.benchmarks.report import print_report, report
-    from sb3_uav.evaluation.benchmarks.run import run_benchmark
-    from sb3_uav.evaluation.benchmarks.summary_file import notes, omissions, repairs
+    from sb3_uav.evaluation.benchmarks.run import compare_results, run_benchmark
+    from sb3_uav.evaluation.merge import merge
     from sb3_uav.solvers.unavailable import UnavailableSolver
 
     # What may be missing or wrong is found before the long run, not after it.
@@ -155,28 +165,60 @@ def main(argv: Sequence[str] | None = None) -> int:
     solvers, wrong = solvers_of(args.solvers, args.device, args.batch_size)
     if wrong and all(isinstance(solver, UnavailableSolver) for solver in solvers):
         raise wrong[0]
-    try:
-        with _Progress(_n_results(solvers, len(benchmark.instances), time_limits)) as progress:
-            rows = run_benchmark(
-                solvers,
-                benchmark,
-                best_known,
-                args.out,
-                args.seed,
-                progress,
-                time_limits=time_limits,
-                n_jobs=args.jobs,
-                resume=not args.overwrite,
-                use_rounding=args.use_rounding,
-            )
-    except KeyboardInterrupt:
-        print(f"sb3-uav: {args.out} holds the results so far; run the same command again to resume.", file=sys.stderr)
-        raise
-    name = args.folder.resolve().name
+    about = {
+        "folder": str(args.folder),
+        "best_known": str(args.best_known),
+        "only": list(args.only),
+        "use_rounding": args.use_rounding,
+    }
+
+    def run(shard: Shard, out: Path) -> list[GapRow]:
+        try:
+            with _Progress(_n_results(solvers, benchmark, time_limits, shard)) as progress:
+                return run_benchmark(
+                    solvers,
+                    benchmark,
+                    best_known,
+                    out,
+                    args.seed,
+                    progress,
+                    time_limits=time_limits,
+                    n_jobs=args.jobs,
+                    resume=not args.overwrite,
+                    use_rounding=args.use_rounding,
+                    shard=shard,
+                    about={"benchmark": about},
+                )
+        except KeyboardInterrupt:
+            print(f"sb3-uav: {out} holds the results so far; run the same command again to resume.", file=sys.stderr)
+            raise
+
+    def join(folders: Sequence[Path], out: Path) -> list[GapRow]:
+        merge(folders, out, args.overwrite)
+        return compare_results(out, benchmark, best_known, args.use_rounding)
+
+    rows = run_shard(args, run, join)
+    return _OK if rows is None else report_gaps(rows, benchmark, best_known, args.out)
+
+
+def report_gaps(rows: Sequence[GapRow], benchmark: BenchmarkFolder, best_known: Mapping[str, float], out: Path) -> int:
+    """
+    Print the table and what has to be known of it, and draw the curve.
+
+    :param rows: What :func:`~sb3_uav.evaluation.benchmarks.run_benchmark` returned
+    :param benchmark: The benchmark
+    :param best_known: Best-known values
+    :param out: Folder of the results
+    :return: Exit code, see :data:`_EPILOG`
+    """
+    from sb3_uav.evaluation.benchmarks.report import print_report, report
+    from sb3_uav.evaluation.benchmarks.summary_file import notes, omissions, repairs
+
+    name = benchmark.path.resolve().name
     print_report(report(rows), f"{name}: {len(benchmark.instances)} instances, gap to the best-known values")
     for line in (*notes(benchmark, best_known), *repairs(rows), *omissions(rows)):
         print(line)
-    files = [args.out / "summary.md", *_draw_curve(rows, args.out, name)]
+    files = [out / "summary.md", *_draw_curve(rows, out, name)]
     print(*(str(path) for path in files))
     return _exit_code(rows)
 

@@ -14,6 +14,9 @@ from sb3_uav.common.optional import install_command
 
 if TYPE_CHECKING:
     from sb3_uav.envs import Instances
+    from sb3_uav.evaluation import SummaryRow
+    from sb3_uav.evaluation.instance_sets import InstanceFiles
+    from sb3_uav.evaluation.shard import Shard
     from sb3_uav.solvers import Solver
 
 _OK, _INFEASIBLE, _USER_ERROR, _FAILED = 0, 1, 2, 3
@@ -32,7 +35,12 @@ files in DIR:
   results.csv, schedules.jsonl    one line per solver and instance, written as soon as it is known
   summary.csv, summary.json       the table, with more columns
   evaluation.json                 solvers, hashes of instances and zips, seeds, versions of packages
-  Rerun the same command to resume an interrupted run; further runs add solvers, time limits and seeds.
+  Rerun the same command to resume an interrupted run; further runs add solvers, time limits and seeds. Results that are kept
+  are checked again: one that is not what the checker says of its routes is refused.
+
+several machines or processes:
+  --shard I/N evaluates part I of N of every set, each in a DIR of its own; `sb3-uav merge DIR... --out DIR` joins them.
+  torchrun --nproc-per-node N -m sb3_uav evaluate ... does both, with the parts in DIR/shard-I-of-N.
 
 exit code:
   0    all schedules are feasible
@@ -54,7 +62,14 @@ def _make_parser() -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--instances", type=Path, nargs="+", required=True, metavar="NPZ", help="instance files")
+    parser.add_argument(
+        "--instances",
+        type=Path,
+        nargs="+",
+        required=True,
+        metavar="NPZ",
+        help="instance files; a folder of such files is one set",
+    )
     parser.add_argument(
         "--solvers", nargs="+", default=[], metavar="NAME[:KEY=VALUE,...]", help="solvers, e.g. kmeans-nearest (see below)"
     )
@@ -77,8 +92,8 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _warn_of_tasks_out_of_reach(name: str, instances: Instances) -> None:
-    """Say on stderr how many tasks no UAV can serve, and name those that must be served."""
+def _warn_of_tasks_out_of_reach(name: str, instances: Instances, first: int = 0) -> None:
+    """Say on stderr how many tasks no UAV can serve, and name those that must be served; rows are counted from ``first``."""
     reachable = instances.reachable()
     n_real, n_reachable = int(instances.task_mask.sum()), int(reachable.sum())
     if n_reachable == n_real:
@@ -90,24 +105,16 @@ def _warn_of_tasks_out_of_reach(name: str, instances: Instances) -> None:
     lost = instances.must_serve & instances.task_mask & ~reachable
     for row in lost.any(1).nonzero()[:, 0].tolist():
         tasks = ", ".join(str(task) for task in lost[row].nonzero()[:, 0].tolist())
-        print(f"sb3-uav: {name}: instance {row}: tasks that must be served are among them: {tasks}.", file=sys.stderr)
+        print(f"sb3-uav: {name}: instance {first + row}: tasks that must be served are among them: {tasks}.", file=sys.stderr)
 
 
-def _load_instances(paths: Sequence[Path]) -> dict[str, Instances]:
-    """
-    :param paths: The files
-    :return: Their instances by the stem of the file, or by the whole path where stems are alike
-    :raises FileNotFoundError: If a file is missing
-    :raises ValueError: If a file is damaged or given twice
-    """
-    from sb3_uav.envs import Instances
-
-    stems = [path.stem for path in paths]
-    names = [str(path) if stems.count(path.stem) > 1 else path.stem for path in paths]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"--instances names {name} twice; give every file once.")
-    return {name: Instances.load(path) for name, path in zip(names, paths, strict=True)}
+def _warn_of(name: str, files: InstanceFiles) -> None:
+    """The same for a set of files, one after the other."""
+    first = 0
+    for part in range(len(files.paths)):
+        batch = files.load(part)
+        _warn_of_tasks_out_of_reach(name, batch, first)
+        first += len(batch)
 
 
 def _make_solvers(args: argparse.Namespace) -> list[Solver]:
@@ -194,32 +201,52 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises ImportError: If a package that evaluations need is not installed
     """
     args = _make_parser().parse_args(argv)
+    from sb3_uav.cli.shards import run_shard
+    from sb3_uav.evaluation.instance_sets import files_of
+    from sb3_uav.evaluation.merge import merge
     from sb3_uav.evaluation.run import evaluate, find_reference
-    from sb3_uav.evaluation.table import print_table, require_rich
+    from sb3_uav.evaluation.table import require_rich
 
     # What may be missing or wrong is found before the long run, not after it.
     require_rich()
-    instances = _load_instances(args.instances)
-    for name, batch in instances.items():
-        _warn_of_tasks_out_of_reach(name, batch)
+    instances = files_of(args.instances)
+    for name, files in instances.items():
+        _warn_of(name, files)
     solvers = _make_solvers(args)
     reference = find_reference(solvers, args.reference)
-    try:
-        with ProgressLines() as progress:
-            summary = evaluate(
-                solvers,
-                instances,
-                args.out,
-                args.seed,
-                progress,
-                time_limits=args.time_limit or (None,),
-                n_jobs=args.jobs,
-                reference=reference,
-                resume=not args.overwrite,
-            )
-    except KeyboardInterrupt:
-        print(f"sb3-uav: {args.out} holds the results so far; run the same command again to resume.", file=sys.stderr)
-        raise
+
+    def run(shard: Shard, out: Path) -> list[SummaryRow]:
+        try:
+            with ProgressLines() as progress:
+                return evaluate(
+                    solvers,
+                    instances,
+                    out,
+                    args.seed,
+                    progress,
+                    time_limits=args.time_limit or (None,),
+                    n_jobs=args.jobs,
+                    reference=reference,
+                    resume=not args.overwrite,
+                    shard=shard,
+                )
+        except KeyboardInterrupt:
+            print(f"sb3-uav: {out} holds the results so far; run the same command again to resume.", file=sys.stderr)
+            raise
+
+    summary = run_shard(args, run, partial(merge, overwrite=args.overwrite))
+    return _OK if summary is None else report_summary(summary)
+
+
+def report_summary(summary: Sequence[SummaryRow]) -> int:
+    """
+    Print the tables on the standard output, and what is wrong on the standard error.
+
+    :param summary: The summary of an evaluation
+    :return: Exit code, see :data:`_EPILOG`
+    """
+    from sb3_uav.evaluation.table import print_table
+
     print_table(summary)
     # A solver that uses no time limit stands in the summary of each.
     violations = dict.fromkeys(violation for row in summary for violation in row.violations)

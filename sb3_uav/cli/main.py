@@ -26,6 +26,7 @@ _FORWARDED = {
     "replan": ("sb3_uav.cli.replan:main", "plan a mission again while its UAVs are in the air"),
     "evaluate": ("sb3_uav.cli.evaluate:main", "evaluate zips and solvers on the same instances"),
     "bench": ("sb3_uav.cli.bench:main", "compare solvers with the best-known values of public benchmarks"),
+    "merge": ("sb3_uav.cli.merge:main", "join the results of the shards of an evaluation or benchmark"),
     "anytime": ("sb3_uav.cli.anytime:main", "draw objective against time from an evaluation"),
     "reproduce": ("sb3_uav.cli.reproduce:main", "make the tables and figures of the paper"),
     "compare": ("sb3_uav.cli.compare:main", "train algorithms at an equal budget and compare them"),

@@ -23,6 +23,11 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         help="solve N instances at once in processes of one thread each; networks stay in this one (default: %(default)s)",
     )
     parser.add_argument("--overwrite", action="store_true", help="start over instead of resuming from the results in DIR")
+    parser.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="evaluate only part I of N, from 1, of every set, for several machines; `sb3-uav merge` joins their folders",
+    )
     networks = parser.add_argument_group("networks")
     networks.add_argument("--device", default="auto", help="cpu, cuda, cuda:0, ... (default: %(default)s)")
     networks.add_argument("--batch-size", type=int, help="instances solved at once, default: as many as memory allows")

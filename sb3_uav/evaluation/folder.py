@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from sb3_uav.common.files import replaced_when_complete, write_csv
-from sb3_uav.envs.instances import Instances
+from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.evaluation.instance_sets import InstanceSet
 from sb3_uav.evaluation.provenance import describe_machine, describe_solver
-from sb3_uav.evaluation.results import (
-    FAILED,
-    RESULT_COLUMNS,
-    RESULTS_FILE,
-    SCHEDULES_FILE,
-    SETTINGS_FILE,
-    ResultKey,
-    ResultRow,
-    one_line,
-    read_results,
-    read_schedules,
-)
+from sb3_uav.evaluation.result_index import Place, ResultIndex
+from sb3_uav.evaluation.result_lines import ResultLines, copy_in_order, read_index
+from sb3_uav.evaluation.results import RESULTS_FILE, SCHEDULES_FILE, SETTINGS_FILE, ResultRow, one_line
+from sb3_uav.evaluation.shard import Shard
 from sb3_uav.solvers.base import Solver
 
 # Of ``evaluation.json``.
@@ -43,53 +35,55 @@ class EvaluationFolder:
     ``results.csv``, ``schedules.jsonl`` and ``evaluation.json`` of one folder.
 
     Each result is appended and flushed as soon as it is known, its schedule first, and counts as present when both lines are
-    whole. When a result comes twice, the later one counts.
+    whole. Of an instance on which a solver failed, a later result counts. Memory holds the place of each result and its
+    figures, not its lines.
 
     :param folder: The folder; it exists
-    :param sources: The sets of instances, on the CPU
+    :param sets: The sets of instances
     :param solvers: The solvers that are going to run
     :param run: Description of this run for ``evaluation.json``
     :param resume: Whether to keep the results that are present, instead of starting over
-    :raises ValueError: If there are results to resume, but of other instances, of other solvers with the same names, or of
-        another format; or if the folder cannot be written
-    :ivar rows: The results that are present
+    :param shard: The part of the instances that this folder is for
+    :raises ValueError: If there are results to resume, but of other instances, of other solvers with the same names, of
+        another shard or of another format; if a result is not what the checker says of its routes; or if the folder cannot be
+        written
+    :ivar index: The results that are present
     :ivar changed_versions: Packages that have changed since the run before, with their versions
     """
 
     def __init__(
         self,
         folder: Path,
-        sources: Mapping[str, Instances],
+        sets: Sequence[InstanceSet],
         solvers: Sequence[Solver],
         run: Mapping[str, Any],
         resume: bool,
+        shard: Shard = Shard(),  # noqa: B008 (a tuple)
     ) -> None:
         self.folder = folder
-        self.rows: dict[ResultKey, ResultRow] = {}
         self.changed_versions: list[str] = []
-        self._schedules: dict[ResultKey, str] = {}
         settings: dict[str, Any] = {
             "format": FORMAT,
-            "instances": [
-                {"name": name, "n_instances": len(batch), "sha256": batch.digest()} for name, batch in sources.items()
-            ],
+            **({} if shard.is_whole else {"shard": str(shard)}),
+            "instances": [one.description() for one in sets],
             "solvers": {solver.name: describe_solver(solver) for solver in solvers},
             "runs": [{**run, **describe_machine()}],
         }
         resume = resume and (folder / RESULTS_FILE).exists()
         if resume:
             settings = self._merged(settings)
-        self._source_order = {source["name"]: position for position, source in enumerate(settings["instances"])}
-        self._solver_order = {name: position for position, name in enumerate(settings["solvers"])}
+        self._sets: list[dict[str, Any]] = settings["instances"]
+        self._solvers: list[str] = list(settings["solvers"])
+        self.index = ResultIndex(sum(one["n_instances"] for one in self._sets))
         if resume:
-            self._read({solver.name for solver in solvers if not solver.uses_time_limit})
+            self._read(sets, {solver.name for solver in solvers if not solver.uses_time_limit})
         # In this order, so that old results never stand beside new settings.
         self._write_in_order()
         with replaced_when_complete(folder / SETTINGS_FILE) as file:
             json.dump(settings, file, indent=2, allow_nan=False)
             file.write("\n")
-        self._results_file = open(folder / RESULTS_FILE, "a", encoding="utf-8", newline="")
-        self._schedules_file = open(folder / SCHEDULES_FILE, "a", encoding="utf-8", newline="")
+        self._results_file = open(folder / RESULTS_FILE, "ab")
+        self._schedules_file = open(folder / SCHEDULES_FILE, "ab")
 
     def __enter__(self) -> EvaluationFolder:
         return self
@@ -107,27 +101,17 @@ class EvaluationFolder:
         :param row: The line of ``results.csv``
         :param schedule: The line of ``schedules.jsonl``, if the solver found a schedule
         """
+        schedule_at = -1
         if schedule is not None:
-            line = json.dumps({**schedule, "time_limit": row.time_limit, "seed": row.seed})
-            self._schedules_file.write(line + "\n")
-            self._schedules_file.flush()
-            self._schedules[row.key] = line
-        csv.writer(self._results_file, lineterminator="\n").writerow(asdict(row).values())
-        self._results_file.flush()
-        self.rows[row.key] = row
+            schedule_at = _append(self._schedules_file, json.dumps(schedule) + "\n")
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow(asdict(row).values())
+        result_at = _append(self._results_file, line.getvalue())
+        self.index.of(row.key).set(row, Place(result_at, schedule_at))
 
     def _write_in_order(self) -> None:
         """Rewrite both files: set by set, and within a set in the order in which the solvers first appeared."""
-
-        def position(row: ResultRow) -> tuple[float, ...]:
-            limit = -math.inf if row.time_limit is None else row.time_limit
-            return self._source_order[row.source], self._solver_order[row.solver], row.seed, limit, row.instance
-
-        ordered = sorted(self.rows.values(), key=position)
-        with replaced_when_complete(self.folder / SCHEDULES_FILE) as file:
-            file.writelines(self._schedules[row.key] + "\n" for row in ordered if row.status != FAILED)
-        with replaced_when_complete(self.folder / RESULTS_FILE) as file:
-            write_csv(file, RESULT_COLUMNS, (asdict(row).values() for row in ordered))
+        copy_in_order(self.index, self._sets, self._solvers, [self.folder], self.folder)
 
     def _merged(self, settings: dict[str, Any]) -> dict[str, Any]:
         """
@@ -142,6 +126,9 @@ class EvaluationFolder:
             if earlier["format"] != FORMAT:
                 raise ValueError(f"its format is {earlier['format']!r}, expected {FORMAT}")
             sources = [{key: source[key] for key in ("name", "n_instances", "sha256")} for source in earlier["instances"]]
+            if not all(type(source["n_instances"]) is int and 0 < source["n_instances"] < 2**31 for source in sources):
+                raise ValueError("n_instances is no number of instances")
+            shard = earlier.get("shard")
             # None for solvers that could not be made.
             solvers = {
                 name: None if solver["settings"] is None else dict(solver["settings"])
@@ -152,6 +139,10 @@ class EvaluationFolder:
             raise ValueError(
                 f"{path}: does not describe the {RESULTS_FILE} beside it ({one_line(error)}); {remedy}."
             ) from error
+        if shard != settings.get("shard"):
+            raise ValueError(
+                f"{self.folder}: holds results of {_shard_of(shard)}, not of {_shard_of(settings.get('shard'))}; {remedy}."
+            )
         # Instances are numbered through all sets, so that one list must be the beginning of the other.
         for before, now in zip(sources, settings["instances"], strict=False):
             if before != now:
@@ -184,27 +175,39 @@ class EvaluationFolder:
         ]
         return {
             "format": FORMAT,
+            **({} if shard is None else {"shard": shard}),
             "instances": max(sources, settings["instances"], key=len),
             "solvers": {**earlier["solvers"], **described},
             "runs": [*earlier["runs"], *settings["runs"]],
         }
 
-    def _read(self, without_limit: Collection[str]) -> None:
+    def _read(self, sets: Sequence[InstanceSet], without_limit: Collection[str]) -> None:
         """
-        Read the results that are present; those without their schedule are left out.
+        Read the results that are present, and check those of the given instances again; those without their schedule are
+        left out.
 
+        :param sets: The sets of instances at hand
         :param without_limit: Names of solvers that use no time limit. Their failures at a time limit date from runs in which
             that was unknown; they are left out, because no later result would replace them
-        :raises ValueError: If a file is damaged, or of another format
+        :raises ValueError: If a file is damaged or was changed, or is of another format
         """
-        self._schedules = read_schedules(self.folder / SCHEDULES_FILE)
-        for row in read_results(self.folder / RESULTS_FILE):
-            if row.source not in self._source_order or row.solver not in self._solver_order:
-                raise ValueError(
-                    f"{self.folder / RESULTS_FILE}: holds results of {row.solver!r} on {row.source!r}, of which "
-                    f"{SETTINGS_FILE} holds no description; choose another folder, or start over with --overwrite."
-                )
-            if row.status == FAILED and row.time_limit is not None and row.solver in without_limit:
-                continue
-            if row.status == FAILED or row.key in self._schedules:
-                self.rows[row.key] = row
+        self.index = read_index(self.folder, self._sets, self._solvers, without_limit)
+        with ResultLines(self.folder) as lines:
+            for one in sets:
+                for first, size in one.places():
+                    start = one.first_index + first
+                    if any(run.present[start : start + size].any() for run in self.index.runs.values()):
+                        lines.check_again(self.index, one.part_at(first), start)
+
+
+def _append(file: IO[bytes], text: str) -> int:
+    """:return: Where the text begins in the file, which has it when this returns"""
+    place = file.tell()
+    file.write(text.encode())
+    file.flush()
+    return place
+
+
+def _shard_of(shard: object) -> str:
+    """:return: The shard of a folder, for messages"""
+    return "all instances" if shard is None else f"shard {shard}"

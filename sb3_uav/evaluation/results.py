@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -84,6 +85,10 @@ _NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
 _OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound", "unserved"}
 
 
+# Whole numbers but seeds are below, so that the arrays of summaries hold them.
+_MAX_WHOLE_NUMBER = 2**31
+
+
 def one_line(text: object) -> str:
     """
     :param text: Anything that can be printed
@@ -92,51 +97,93 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
+class Line(NamedTuple):
+    """
+    A line of a file.
+
+    :param number: From 1
+    :param offset: Where it begins, in bytes
+    :param text: Its text, without the line break
+    """
+
+    number: int
+    offset: int
+    text: str
+
+
 def read_results(path: Path) -> list[ResultRow]:
     """
     :param path: A ``results.csv``; a last line that a crash cut short is left out
     :return: Its rows
     :raises ValueError: If another program, or a later version, wrote it, or it was damaged
     """
-    header, *lines = _whole_lines(path) or [""]
+    return [row for _, row in iterate_results(path)]
+
+
+def iterate_results(path: Path) -> Iterator[tuple[Line, ResultRow]]:
+    """
+    :param path: As of :func:`read_results`
+    :return: Its rows, one after the other, with their lines
+    :raises ValueError: As :func:`read_results`
+    """
+    lines = whole_lines(path)
+    header = next(lines, Line(1, 0, "")).text
     columns = {",".join(names): names for names in (RESULT_COLUMNS, _EARLIER_COLUMNS)}.get(header)
     if columns is None:
         raise ValueError(
             f"{path}: its columns are not those that this version writes ({header!r:.120}); "
             "choose another folder, or start over with --overwrite."
         )
-    rows = []
-    for number, line in enumerate(lines, start=2):
+    for line in lines:
         try:
-            rows.append(_parse_row(columns, next(csv.reader([line], strict=True))))
+            row = parse_result(columns, line.text)
         except (ValueError, csv.Error, StopIteration) as error:
-            raise ValueError(
-                f"{path}, line {number}: is damaged ({error}); correct or delete that line, or start over with --overwrite."
-            ) from error
-    return rows
+            raise damaged(path, line, error) from error
+        yield line, row
 
 
-def _whole_lines(path: Path) -> list[str]:
+def damaged(path: Path, line: Line, what: object) -> ValueError:
+    """
+    :param path: A file of results
+    :param line: One of its lines
+    :param what: What is wrong with it
+    :return: The error to raise
+    """
+    return ValueError(
+        f"{path}, line {line.number}: is damaged ({what}); correct or delete that line, or start over with --overwrite."
+    )
+
+
+def whole_lines(path: Path) -> Iterator[Line]:
     """
     :param path: A text file that was written line by line
     :return: Its lines, except for a last one without a line break
     :raises ValueError: If it is not a text file
     """
-    try:
-        text, end, _ = path.read_bytes().rpartition(b"\n")
-        # Not by splitlines, which also splits at characters that may be part of a name.
-        return text.decode("utf-8").split("\n") if end else []
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is damaged ({error}); start over with --overwrite.") from error
+    offset = 0
+    with path.open("rb") as file:
+        # In binary, where only line feeds end lines: other line breaks may be part of a name.
+        for number, content in enumerate(file, start=1):
+            if not content.endswith(b"\n"):
+                return
+            try:
+                text = content[:-1].decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise ValueError(f"{path}: is damaged (line {number}: {error}); start over with --overwrite.") from error
+            yield Line(number, offset, text)
+            offset += len(content)
 
 
-def _parse_row(columns: Sequence[str], cells: Sequence[str]) -> ResultRow:
+def parse_result(columns: Sequence[str], text: str) -> ResultRow:
     """
     :param columns: Names of the columns
-    :param cells: One line of ``results.csv``
+    :param text: One line of ``results.csv``
     :return: The row
     :raises ValueError: If a cell has a wrong value
+    :raises csv.Error: If it is no line of a CSV
+    :raises StopIteration: If it is empty
     """
+    cells = next(csv.reader([text], strict=True))
     if len(cells) != len(columns):
         raise ValueError(f"{len(cells)} cells instead of {len(columns)}")
     values: dict[str, Any] = dict(zip(columns, cells, strict=True))
@@ -149,9 +196,14 @@ def _parse_row(columns: Sequence[str], cells: Sequence[str]) -> ResultRow:
             values[name] = None
         else:
             values[name] = int(values[name]) if name in _WHOLE_NUMBERS else float(values[name])
+            if not (math.isfinite(values[name]) if name in _NUMBERS else name == "seed" or values[name] < _MAX_WHOLE_NUMBER):
+                raise ValueError(f"{name} is {values[name]}")
     if values["feasible"] not in ("True", "False") or values["status"] not in (OK, INFEASIBLE, FAILED):
         raise ValueError(f"feasible is {values['feasible']!r} and status is {values['status']!r}")
     values["feasible"] = values["feasible"] == "True"
+    for name in ("instance", "seed", "seconds", "time_limit"):
+        if values[name] is not None and values[name] < 0:
+            raise ValueError(f"{name} is {values[name]}, below 0")
     return ResultRow(**values)
 
 
@@ -161,15 +213,24 @@ def read_schedules(path: Path) -> dict[ResultKey, str]:
     :return: Its lines by result
     :raises ValueError: If it was damaged
     """
-    lines = _whole_lines(path) if path.is_file() else []
-    schedules = {}
-    for number, line in enumerate(lines, start=1):
+    return {key: line.text for line, key in iterate_schedules(path)}
+
+
+def iterate_schedules(path: Path) -> Iterator[tuple[Line, ResultKey]]:
+    """
+    :param path: A ``schedules.jsonl``, which may be missing
+    :return: Its lines, one after the other, with the results that they belong to
+    :raises ValueError: If it was damaged
+    """
+    if not path.is_file():
+        return
+    for line in whole_lines(path):
         try:
-            record = json.loads(line)
+            record = json.loads(line.text)
             key = ResultKey(*(record[name] for name in ResultKey._fields))
-            schedules[key] = line
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{path}, line {number}: is damaged ({error!r}); correct or delete that line, or start over with --overwrite."
-            ) from error
-    return schedules
+            is_whole = type(key.instance) is int and type(key.seed) is int and type(key.solver) is str
+            if not is_whole or type(key.time_limit) not in (int, float, type(None)):
+                raise ValueError(f"it is of {tuple(key)}")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise damaged(path, line, repr(error)) from error
+        yield line, key

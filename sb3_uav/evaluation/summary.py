@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_uav.common.files import replaced_when_complete, write_csv
 from sb3_uav.common.statistics import CONFIDENCE, confidence_halfwidth
-from sb3_uav.evaluation.results import FAILED, INFEASIBLE, RESULTS_FILE, ResultRow
+from sb3_uav.evaluation.result_index import Figures
+from sb3_uav.evaluation.results import FAILED, INFEASIBLE, RESULTS_FILE
 
 SUMMARY_CSV, SUMMARY_JSON = "summary.csv", "summary.json"
 # Solvers prove bounds up to rounding errors.
@@ -110,30 +112,31 @@ def _optimality_gap(objectives: np.ndarray, bounds: np.ndarray) -> float:
 
 
 def summarize(
-    source: str, results: Mapping[str, Sequence[ResultRow]], reference: str, time_limit: float | None = None
+    source: str, rows: np.ndarray, results: Mapping[str, Figures], reference: str, time_limit: float | None = None
 ) -> list[SummaryRow]:
     """
     Compare solvers on one set of instances.
 
     :param source: Name of the set
-    :param results: Results of every solver, of the same instances in the same order
+    :param rows: ``(n,)`` rows of the instances in the set, at least one
+    :param results: Results of every solver on these instances, in the same order
     :param reference: Name of the solver that the others are compared with
     :param time_limit: Seconds that solvers were given for each instance
     :return: One row per solver
     """
-    objectives = {solver: _column(rows, "objective") for solver, rows in results.items()}
-    bounds = {solver: _column(rows, "bound") for solver, rows in results.items()}
-    complete = [float(values.mean()) for values in objectives.values()]
-    best_bounds = np.fmin.reduce(list(bounds.values()))
-    best_found = np.fmax.reduce(list(objectives.values()))
+    complete = [float(figures.objective.mean()) for figures in results.values()]
+    best_bounds = np.fmin.reduce([figures.bound for figures in results.values()])
+    best_found = np.fmax.reduce([figures.objective for figures in results.values()])
+    baseline = results[reference].objective
     summary = []
-    for (solver, rows), gap in zip(results.items(), gaps(complete), strict=True):
-        found = objectives[solver][~np.isnan(objectives[solver])]
-        paired = ~np.isnan(objectives[solver]) & ~np.isnan(objectives[reference])
-        differences = (objectives[solver] - objectives[reference])[paired]
+    for (solver, figures), gap in zip(results.items(), gaps(complete), strict=True):
+        objectives, bounds, seconds = figures.objective, figures.bound, figures.seconds
+        found = objectives[~np.isnan(objectives)]
+        paired = ~np.isnan(objectives) & ~np.isnan(baseline)
+        differences = (objectives - baseline)[paired]
         difference, halfwidth = _mean(differences), float(confidence_halfwidth(differences))
-        reference_objective = _mean(objectives[reference][paired])
-        seconds = _column(rows, "seconds")
+        reference_objective = _mean(baseline[paired])
+        messages = _Messages(solver, source, rows, figures)
         summary.append(
             SummaryRow(
                 solver=solver,
@@ -149,78 +152,77 @@ def summarize(
                 difference=difference,
                 difference_low=difference - halfwidth,
                 difference_high=difference + halfwidth,
-                ratio=_mean(objectives[solver][paired]) / reference_objective if reference_objective > 0 else math.nan,
-                n_bounds=int((~np.isnan(bounds[solver])).sum()),
-                bound=_mean(bounds[solver][~np.isnan(bounds[solver])]),
-                optimality_gap=_optimality_gap(objectives[solver], best_bounds),
+                ratio=_mean(objectives[paired]) / reference_objective if reference_objective > 0 else math.nan,
+                n_bounds=int((~np.isnan(bounds)).sum()),
+                bound=_mean(bounds[~np.isnan(bounds)]),
+                optimality_gap=_optimality_gap(objectives, best_bounds),
                 seconds=_mean(seconds[~np.isnan(seconds)]),
-                batch_size=max(row.batch_size or 0 for row in rows),
-                n_unserved=sum(row.unserved or 0 for row in rows),
-                violations=(*_violations(rows), *_wrong_bounds(rows, best_found)),
-                failures=_failures(rows),
-                unserved=_unserved(rows),
+                batch_size=int(figures.batch_size.max()),
+                n_unserved=int(figures.unserved.sum()),
+                violations=(*messages.violations(), *messages.wrong_bounds(best_found)),
+                failures=messages.failures(),
+                unserved=messages.unserved(),
             )
         )
     return summary
-
-
-def _column(rows: Sequence[ResultRow], name: str) -> np.ndarray:
-    """One column of the results, ``(n,)`` float64, NaN where it is None."""
-    values = [getattr(row, name) for row in rows]
-    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
 def _mean(values: np.ndarray) -> float:
     return math.fsum(values) / len(values) if len(values) > 0 else math.nan
 
 
-def _violations(rows: Sequence[ResultRow]) -> list[str]:
-    return [
-        f"{row.solver}, instance {row.instance - rows[0].instance} of {row.source}: {row.message}"
-        for row in rows
-        if row.status == INFEASIBLE
-    ]
-
-
-def _wrong_bounds(rows: Sequence[ResultRow], best_found: np.ndarray) -> list[str]:
+class _Messages(NamedTuple):
     """
-    :param rows: Results of one solver
-    :param best_found: ``(n,)``, best objective of all solvers; NaN where there is none
-    :return: Which of its bounds cannot be true
-    """
-    return [
-        f"{row.solver}, instance {row.instance - rows[0].instance} of {row.source}: its upper bound of {row.bound:g} is below "
-        f"{best:g}, which a feasible schedule achieves."
-        for row, best in zip(rows, best_found, strict=True)
-        if row.bound is not None and best > row.bound + _BOUND_TOLERANCE * max(1.0, abs(row.bound))
-    ]
+    What is to be said of the results of a solver.
 
+    :param solver: Its name
+    :param source: Name of the set
+    :param rows: ``(n,)`` rows of the instances in the set
+    :param figures: The results on these
+    """
 
-def _failures(rows: Sequence[ResultRow]) -> tuple[str, ...]:
-    """
-    :param rows: Results of one solver
-    :return: The reasons, each once
-    """
-    counts: dict[str, int] = {}
-    for row in rows:
-        if row.status == FAILED:
-            counts[row.message] = counts.get(row.message, 0) + 1
-    return tuple(
-        f"{rows[0].solver} failed on {count} of {len(rows)} instances of {rows[0].source}: {message}"
-        for message, count in counts.items()
-    )
+    solver: str
+    source: str
+    rows: np.ndarray
+    figures: Figures
 
+    def violations(self) -> list[str]:
+        """:return: Why schedules are infeasible"""
+        places = np.nonzero(self.figures.has_status(INFEASIBLE))[0].tolist()
+        return [f"{self._instance(place)}: {self.figures.messages[place]}" for place in places]
 
-def _unserved(rows: Sequence[ResultRow]) -> tuple[str, ...]:
-    """
-    :param rows: Results of one solver
-    :return: On how many instances it leaves tasks that must be served, because means of values do not show that
-    """
-    n_rows = sum((row.unserved or 0) > 0 for row in rows)
-    if n_rows == 0:
-        return ()
-    text = "leaves out tasks that must be served, so that its value is no measure of how good its schedules are"
-    return (f"{rows[0].solver}, {n_rows} of {len(rows)} instances of {rows[0].source}: {text}; see {RESULTS_FILE}.",)
+    def _instance(self, place: int) -> str:
+        return f"{self.solver}, instance {self.rows[place]} of {self.source}"
+
+    def wrong_bounds(self, best_found: np.ndarray) -> list[str]:
+        """
+        :param best_found: ``(n,)``, best objective of all solvers; NaN where there is none
+        :return: Which bounds cannot be true
+        """
+        bounds = self.figures.bound
+        wrong = best_found > bounds + _BOUND_TOLERANCE * np.maximum(1.0, np.abs(bounds))
+        return [
+            f"{self._instance(place)}: its upper bound of {bounds[place]:g} is below {best_found[place]:g}, which a feasible "
+            "schedule achieves."
+            for place in np.nonzero(wrong)[0].tolist()
+        ]
+
+    def failures(self) -> tuple[str, ...]:
+        """:return: The reasons, each once"""
+        failed = np.nonzero(self.figures.has_status(FAILED))[0].tolist()
+        counts = Counter(self.figures.messages[place] for place in failed)
+        return tuple(
+            f"{self.solver} failed on {count} of {len(self.rows)} instances of {self.source}: {message}"
+            for message, count in counts.items()
+        )
+
+    def unserved(self) -> tuple[str, ...]:
+        """:return: On how many instances it leaves tasks that must be served, because means of values do not show that"""
+        n_rows = int((self.figures.unserved > 0).sum())
+        if n_rows == 0:
+            return ()
+        text = "leaves out tasks that must be served, so that its value is no measure of how good its schedules are"
+        return (f"{self.solver}, {n_rows} of {len(self.rows)} instances of {self.source}: {text}; see {RESULTS_FILE}.",)
 
 
 def write_summary(summary: Sequence[SummaryRow], folder: Path, about: Mapping[str, Any]) -> None:

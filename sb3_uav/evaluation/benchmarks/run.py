@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from sb3_uav.common.files import write_atomically
 from sb3_uav.evaluation.benchmarks.collection import BenchmarkFolder, batch_of, evaluation_sets
 from sb3_uav.evaluation.benchmarks.gaps import GAPS_FILE, ROUTES_FILE, GapRow, find_gaps, write_gaps
 from sb3_uav.evaluation.benchmarks.summary_file import SUMMARY_FILE, summary_text
+from sb3_uav.evaluation.instance_sets import instance_sets
 from sb3_uav.evaluation.locking import locked_folder
+from sb3_uav.evaluation.results import SETTINGS_FILE
 from sb3_uav.evaluation.run import evaluate
 from sb3_uav.evaluation.set_evaluation import Progress
+from sb3_uav.evaluation.shard import Shard
 from sb3_uav.solvers.base import Solver
 
 # Drawn by the command, if there are several time limits.
@@ -30,6 +35,8 @@ def run_benchmark(
     n_jobs: int = 1,
     resume: bool = False,
     use_rounding: bool = False,
+    shard: Shard = Shard(),  # noqa: B008 (a tuple)
+    about: Mapping[str, Any] | None = None,
 ) -> list[GapRow]:
     """
     Run every solver on every instance of a benchmark, check all schedules, and compare them with the best-known values.
@@ -47,6 +54,8 @@ def run_benchmark(
     :param n_jobs: As of :func:`~sb3_uav.evaluation.run.evaluate`
     :param resume: As of :func:`~sb3_uav.evaluation.run.evaluate`
     :param use_rounding: Whether to put further tasks into tours of OPLib files where rounding leaves room for them
+    :param shard: The part of every set to evaluate
+    :param about: Further entries of the description of this run in ``evaluation.json``
     :return: One row for every result in the folder
     :raises ValueError: If no instance has a best-known value, or as :func:`~sb3_uav.evaluation.run.evaluate` says
     """
@@ -66,11 +75,44 @@ def run_benchmark(
             progress(text, n_done, n_total)
 
     sources = {name: batch_of(members) for name, members in sets.items()}
-    evaluate(solvers, sources, folder, seed, on_progress, time_limits, n_jobs, resume=resume)
+    evaluate(solvers, sources, folder, seed, on_progress, time_limits, n_jobs, resume=resume, shard=shard, about=about)
+    return compare_results(folder, benchmark, best_known, use_rounding)
+
+
+def compare_results(
+    folder: Path, benchmark: BenchmarkFolder, best_known: Mapping[str, float], use_rounding: bool = False
+) -> list[GapRow]:
+    """
+    Compare all results in the folder of an evaluation with the best-known values, and write what a benchmark adds.
+
+    :param folder: The folder
+    :param benchmark: As of :func:`run_benchmark`
+    :param best_known: As of :func:`run_benchmark`
+    :param use_rounding: As of :func:`run_benchmark`
+    :return: One row for every result in the folder
+    :raises ValueError: If a file of the folder is damaged
+    """
+    members = [instance for group in evaluation_sets(list(benchmark.instances.values())).values() for instance in group]
     with locked_folder(folder):
-        rows, routes = find_gaps(
-            folder, [instance for members in sets.values() for instance in members], best_known, use_rounding
-        )
+        rows, routes = find_gaps(folder, members, best_known, use_rounding)
         write_gaps(folder, rows, routes)
         write_atomically(folder / SUMMARY_FILE, summary_text(benchmark, best_known, rows))
     return rows
+
+
+def check_same_instances(folder: Path, benchmark: BenchmarkFolder) -> None:
+    """
+    :param folder: Folder of an evaluation
+    :param benchmark: A benchmark
+    :raises ValueError: If it is not the one that was evaluated
+    """
+    try:
+        described = json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))["instances"]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"{folder / SETTINGS_FILE}: does not describe an evaluation ({error}).") from error
+    sets = evaluation_sets(list(benchmark.instances.values()))
+    if described != [one.description() for one in instance_sets({name: batch_of(of) for name, of in sets.items()})]:
+        raise ValueError(
+            f"{benchmark.path}: holds other instances than those that {folder} has results of; give the folder of that "
+            "benchmark with --benchmark."
+        )
