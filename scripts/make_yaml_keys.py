@@ -16,7 +16,7 @@ from sb3_uav.envs import (
     UniformGenerator,
     WorldGenerator,
 )
-from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy, MaskedAttentionPolicy
+from sb3_uav.policies import EpisodicPolicy, MaskedAttentionPolicy
 from sb3_uav.policies.settings import NetworkSettings
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import (
@@ -47,9 +47,8 @@ ZOO_KEYS = {
 # What YAML cannot give, or what the caller passes.
 LEFT_OUT = {
     "self", "env", "_init_setup_model", "observation_space", "action_space", "lr_schedule", "settings", "others", "module",
-    "router_policy", "allocator", "generator_", "rng", "report", "folder", "record", "share", "device_", "tensorboard_log",
+    "rng", "report", "folder", "record", "share", "tensorboard_log",
 }  # fmt: skip
-# Every table: heading, what stands before it, and what has its keys.
 CALLBACKS = (ITSCallback, FixedSetEvalCallback, PretrainedRouterCallback, SizeGridCallback, EpisodeBufferCallback)
 GENERATORS = (UniformGenerator, ClusteredGenerator, MixtureGenerator, WorldGenerator)
 
@@ -75,9 +74,9 @@ def text() -> str:
     parts = [
         "# Every YAML key",
         "<!-- Written by `python scripts/make_yaml_keys.py`. -->",
-        "An entry of a YAML file has the name of an environment and holds the keys of rl-zoo3 and the arguments of the algorithm. Others\n"
-        "are an error before anything starts. `train --conf-file` names the file; `zoo_configs/` has one for each algorithm. A default of\n"
-        "`-` means that the key is needed. [The zoo](zoo.md) and [training](training.md) have examples.",
+        "An entry of a YAML file has the name of an environment, and holds keys of rl-zoo3 and arguments of the algorithm.\n"
+        "Any other key is an error before anything starts. `train --conf-file` names the file; `zoo_configs/` has one for each\n"
+        "algorithm. Where the default is `-`, the key is needed. Examples: [the zoo](zoo.md), [training](training.md).",
         "## Keys of rl-zoo3",
         _table((name, None, about) for name, about in ZOO_KEYS.items()),
         "## reinforce",
@@ -91,8 +90,8 @@ def text() -> str:
         "And these, of both policies:",
         _of(EpisodicPolicy, {"preset": "`default`, `whole` or `paper`"}),
         "## Masked attention",
-        "`policy_kwargs` of [`MaskedAttentionPolicy`](foreign_environments.md), besides those of SB3's policies and `preset`,\n"
-        "`embed_dim`, `n_layers`, `n_heads`, `ff_dim`, `normalization`, `mixed_precision`:",
+        "`policy_kwargs` of [`MaskedAttentionPolicy`](foreign_environments.md), besides those of SB3's policies and\n"
+        "`preset`, `embed_dim`, `n_layers`, `n_heads`, `ff_dim`, `normalization` and `mixed_precision`:",
         _of(MaskedAttentionPolicy),
         "## Environments",
         "`env_kwargs` of `TaskAllocation-...`:",

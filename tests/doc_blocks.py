@@ -67,6 +67,8 @@ class NotRun(NamedTuple):
 
 NOT_RUN = [
     NotRun("README.md", r"pip install -c", "it installs packages into the environment of the tests"),
+    NotRun("docs/getting_started.md", r"pip install -c", "it installs packages into the environment of the tests"),
+    NotRun("docs/from_rl4co.md", r"# RL4CO\n(?s:.*)", "RL4CO is no dependency of ours, and is not installed"),
     NotRun("CONTRIBUTING.md", r"make install", "it creates an environment and installs packages"),
 ]
 
@@ -103,6 +105,27 @@ RULES = [
     Rule("docs/fine_tuning.md", r"--epochs 29", "--epochs 1 --instances-per-epoch 16 --held-out 3"),
     Rule("docs/fine_tuning.md", r"--held-out 96", "--held-out 4"),
     Rule("docs/fine_tuning.md", r"(sb3-uav train .*) -i", rf"\1 {_SMALL.format('reinforce')} -i"),
+    Rule("docs/getting_started.md", r"(sb3-uav solve .*) -o", r"\1 --time-limit 1 -o"),
+    Rule("docs/getting_started.md", r"random\(\(16, ", "random((2, "),
+    Rule("docs/getting_started.md", r"(sb3-uav train .*?-U3-N20-v0)", rf"\1 {_SMALL.format('reinforce')}"),
+    Rule("docs/own_*.md", r"n_envs=16", "n_envs=2"),
+    Rule("docs/own_*.md", r"learn\(\d+_000\)", "learn(80)"),
+    Rule("docs/own_distribution.md", r"\(64, np", "(4, np"),
+    Rule("docs/gpu.md", r"n_envs=64", "n_envs=2"),
+    Rule("docs/gpu.md", r"learn\(100_000\)", "learn(80)"),
+    Rule("docs/gpu.md", r"(sb3-uav train .*?-U3-N20-v0)", rf"\1 {_SMALL.format('reinforce')}"),
+    Rule("docs/freezing.md", r"=4_000", "=512"),
+    Rule("docs/freezing.md", r"=2_000", "=256"),
+    Rule("docs/freezing.md", r"20_000", "1024"),
+    Rule("docs/from_rl4co.md", r"n_envs=64", "n_envs=2"),
+    Rule("docs/from_rl4co.md", r"learn\(100_000\)", "learn(80)"),
+    Rule("docs/from_pyvrp.md", r"MaxRuntime\(1\)", "MaxRuntime(0.2)"),
+    Rule("docs/from_pyvrp.md", r"time_limit=1", "time_limit=0.2"),
+    Rule("docs/from_rl_zoo3.md", r"zoo_configs/ppo\.yml", "small/ppo.yml -n 320"),
+    Rule("docs/from_rl_zoo3.md", r"(sb3-uav train --algo ppo .*-N20-v0)", r"\1 --conf-file small/ppo.yml -n 320"),
+    Rule("docs/from_rl_zoo3.md", r"n_envs: 64", "n_envs: 4"),
+    Rule("docs/from_rl_zoo3.md", r"n_epochs: 10", "n_epochs: 2"),
+    Rule("docs/from_rl_zoo3.md", r"instances_per_epoch: 1280", "instances_per_epoch: 8"),
     # The files beside the tests have other names.
     Rule("docs/benchmarks.md", r"p7\.\*", "a1.*"),
     Rule("docs/benchmarks.md", r"--time-limits 0\.1 1 10 --jobs 2", "--time-limits 0.02 0.05"),
