@@ -9,14 +9,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP_CONSTRAINTS := $(addprefix -c ,$(CONSTRAINTS))
-LINT_PATHS := sb3_uav tests benchmarks examples scripts
+LINT_PATHS := sb3_uav tests benchmarks examples scripts docs
 # Some are about results, not speed: they take arguments and an hour.
 NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py)
 BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: install demo test test-fast lint format check-codestyle type commit-checks bench clean help
+.PHONY: install demo docs test test-fast lint format check-codestyle type commit-checks bench clean help
 
 install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
 
@@ -30,6 +30,9 @@ $(INSTALLED): setup.cfg pyproject.toml $(CONSTRAINTS)
 
 demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics and draw it, into demo/ (at most 4 minutes)
 	$(BIN)/sb3-uav demo --out demo
+
+docs: $(INSTALLED)  ## Build the documentation site into docs/_build/html; any warning is an error
+	$(BIN)/python -m sphinx -b html -W --keep-going -n docs docs/_build/html
 
 # One process per core, and one thread in each: threads that wait for a busy core cost more than they bring.
 test: $(INSTALLED)  ## Run the whole test suite

@@ -1,19 +1,19 @@
 """
 Generators, distributions, routers and rewards of the user, as objects or, in a YAML, by dotted path.
 
-=============== ==================================================================================================
-argument        what the path names
-=============== ==================================================================================================
-``generator``   a class or function that makes a generator
-                (:class:`~sb3_uav.envs.generators.InstanceGenerator`); those of ``n_tasks``, ``n_uavs`` and
-                ``max_distance`` that it has as parameters are passed to it
+================ =================================================================================================
+argument         what the path names
+================ =================================================================================================
+``generator``    a class or function that makes a generator
+                 (:class:`~sb3_uav.envs.generators.InstanceGenerator`); those of ``n_tasks``, ``n_uavs`` and
+                 ``max_distance`` that it has as parameters are passed to it
 ``distribution`` ``function(n_instances, n_tasks, rng)``, which returns arrays: depots ``(n_instances, 2)``, tasks
-                ``(n_instances, n_tasks, 2)`` and, if not all are 1, values ``(n_instances, n_tasks)``
-``router``      ``function(instances)``, which plans one tour per row (:data:`~sb3_uav.envs.routing.Router`); also
-                the zip of a trained router, or the name of a trained pair
-``reward``      ``function(instances, tours)``, which values one complete schedule per row
-                (:data:`~sb3_uav.envs.rewards.Reward`)
-=============== ==================================================================================================
+                 ``(n_instances, n_tasks, 2)`` and, if not all are 1, values ``(n_instances, n_tasks)``
+``router``       ``function(instances)``, which plans one tour per row (:data:`~sb3_uav.envs.routing.Router`); also
+                 the zip of a trained router, or the name of a trained pair
+``reward``       ``function(instances, tours)``, which values one complete schedule per row
+                 (:data:`~sb3_uav.envs.rewards.Reward`)
+================ =================================================================================================
 
 A mapping from the path to further arguments passes those too, as for callbacks in a zoo's YAML::
 
