@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from sb3_uav.common.json_text import parse_json
 
 RESULTS_FILE = "results.csv"
 SCHEDULES_FILE = "schedules.jsonl"
@@ -111,7 +112,8 @@ def read_results(path: Path) -> list[ResultRow]:
             rows.append(_parse_row(columns, next(csv.reader([line], strict=True))))
         except (ValueError, csv.Error, StopIteration) as error:
             raise ValueError(
-                f"{path}, line {number}: is damaged ({error}); correct or delete that line, or start over with --overwrite."
+                f"{path}, line {number}: is damaged ({error!s:.300}); correct or delete that line, or start over with "
+                "--overwrite."
             ) from error
     return rows
 
@@ -165,7 +167,7 @@ def read_schedules(path: Path) -> dict[ResultKey, str]:
     schedules = {}
     for number, line in enumerate(lines, start=1):
         try:
-            record = json.loads(line)
+            record = parse_json(line)
             key = ResultKey(*(record[name] for name in ResultKey._fields))
             schedules[key] = line
         except (ValueError, KeyError, TypeError) as error:

@@ -130,9 +130,14 @@ class UAVExperimentManager(ExperimentManager):
     def learn(self, model: BaseAlgorithm) -> None:
         try:
             super().learn(model)
-        except (TypeError, OverflowError) as error:
+        except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
+        except ValueError as error:
+            # Others as well, those of the router above all, which is made then.
+            if str(self.config) in str(error):
+                raise
+            raise ValueError(f"{self._where}: {error}") from error
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         env = super().create_envs(n_envs, eval_env, no_log)
