@@ -75,8 +75,8 @@ def text() -> str:
         "# Every YAML key",
         "<!-- Written by `python scripts/make_yaml_keys.py`. -->",
         "An entry of a YAML file has the name of an environment, and holds keys of rl-zoo3 and arguments of the algorithm.\n"
-        "Any other key is an error before anything starts. `train --conf-file` names the file; `zoo_configs/` has one for each\n"
-        "algorithm. Where the default is `-`, the key is needed. Examples: [the zoo](zoo.md), [training](training.md).",
+        "Any other key is an error before anything starts. `train --conf-file` names the file; `zoo_configs/` has one for "
+        "each algorithm.\nWhere the default is `-`, the key is needed. Examples: [the zoo](zoo.md), [training](training.md).",
         "## Keys of rl-zoo3",
         _table((name, None, about) for name, about in ZOO_KEYS.items()),
         "## reinforce",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from ranks import run_ranks
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_uav.common import distributed
@@ -11,7 +12,6 @@ from sb3_uav.envs.allocation import TaskAllocationEnv
 from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
-from tests.ranks import run_ranks
 
 SMALL = dict(embed_dim=16, n_heads=2, n_layers=2, ff_dim=16)
 # Seven instances: shares of 3 and 4.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from ranks import run_ranks
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.logger import configure
 
@@ -20,7 +21,6 @@ from sb3_uav.policies import AllocatorPolicy, RouterPolicy
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.imitation import imitate
-from tests.ranks import run_ranks
 
 SMALL = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
 ROUTER = dict(policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+_LONGEST_MESSAGE = 3000
 _OK, _USER_ERROR, _INTERRUPTED = 0, 2, 130
 
 
@@ -19,11 +20,16 @@ def run_command(prog: str, function: Callable[[], int | None]) -> int:
     try:
         return function() or _OK
     except (ValueError, OSError, ImportError) as error:
-        print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{prog}: error: {_shortened(' '.join(str(error).split()))}", file=sys.stderr)
         return _USER_ERROR
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
         return _INTERRUPTED
+
+
+def _shortened(text: str) -> str:
+    """:return: A message without its middle, where it quotes more of a file than anybody reads; its end says what to do"""
+    return text if len(text) <= _LONGEST_MESSAGE else f"{text[: _LONGEST_MESSAGE // 2]} ... {text[-_LONGEST_MESSAGE // 2 :]}"
 
 
 def main_function(prog: str, function: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:

@@ -12,9 +12,10 @@ def import_object(path: str) -> Any:
     :return: The object
     :raises ValueError: If there is none; whatever the import raises is named
     """
-    module_name, _, name = path.rpartition(".")
+    # Of a YAML, a path may be anything.
+    module_name, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
     if not module_name:
-        raise ValueError(f"{path!r} is no dotted path; write package.module.name.")
+        raise ValueError(f"{path!r:.80} is no dotted path; write package.module.name.")
     try:
         return getattr(import_module(module_name), name)
     # The module may be anybody's, and fail at anything.

@@ -12,6 +12,10 @@ import numpy as np
 # Upper bound of the compression ratio of deflate, which np.savez_compressed uses (https://zlib.net/zlib_tech.html).
 _GREATEST_COMPRESSION = 1032
 _SUFFIX = ".npy"
+# Arrays of one file together. Plain coordinates hardly shrink, and whole numbers with constant columns about thirtyfold;
+# what is small may shrink more, as many copies of one instance do.
+_ALWAYS_READ = 128 * 2**20
+_USUAL_COMPRESSION = 32
 
 
 def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
@@ -45,9 +49,16 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
     try:
         # Not np.load, which would also read a .npy or offer to unpickle whatever else it finds.
         with zipfile.ZipFile(stream) as file:
-            arrays = {}
+            arrays: dict[str, np.ndarray] = {}
             for member in file.infolist():
                 place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
+                _check_member(member)
+            place = ""
+            _check_size(file)
+            for member in file.infolist():
+                place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
+                if member.filename.removesuffix(_SUFFIX) in arrays:
+                    raise ValueError("it stands twice in the file")
                 arrays[member.filename.removesuffix(_SUFFIX)] = _read_array(file, member)
             return arrays
     except Exception as error:
@@ -56,12 +67,20 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
         raise ValueError(f"{source}: not an intact .npz of plain arrays ({place}{found}); {advice}.") from error
 
 
-def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+def _check_size(file: zipfile.ZipFile) -> None:
     """
     :param file: An opened archive
-    :param member: One of its files
-    :return: The array in it
-    :raises Exception: Any kind of exception, if the file is damaged or not an array
+    :raises ValueError: If it would be many times larger in memory
+    """
+    packed, total = (sum(getattr(member, name) for member in file.infolist()) for name in ("compress_size", "file_size"))
+    if total > max(_ALWAYS_READ, _USUAL_COMPRESSION * packed):
+        raise ValueError(f"its {packed} bytes would become {total} bytes, more than arrays of numbers shrink")
+
+
+def _check_member(member: zipfile.ZipInfo) -> None:
+    """
+    :param member: One of the files of an archive
+    :raises ValueError: If it is no array that numpy wrote, or the archive declares more than it can hold
     """
     if not member.filename.endswith(_SUFFIX):
         raise ValueError("the name does not end in .npy")
@@ -71,6 +90,15 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         raise ValueError(
             f"{member.compress_size} compressed bytes cannot hold the {member.file_size} bytes that the archive declares"
         )
+
+
+def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """
+    :param file: An opened archive
+    :param member: One of its files
+    :return: The array in it
+    :raises Exception: Any kind of exception, if the file is damaged or not an array
+    """
     with file.open(member) as stream:
         shape, dtype = _read_header(stream)
         n_bytes = member.file_size - stream.tell()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.common.json_text import parse_json
 from sb3_uav.evaluation.instance_sets import InstanceSet
 from sb3_uav.evaluation.provenance import describe_machine, describe_solver
 from sb3_uav.evaluation.result_index import Place, ResultIndex
@@ -122,7 +123,9 @@ class EvaluationFolder:
         path = self.folder / SETTINGS_FILE
         remedy = "choose another folder, or start over with --overwrite"
         try:
-            earlier = json.loads(path.read_text(encoding="utf-8"))
+            earlier = parse_json(path.read_text(encoding="utf-8"))
+            # It is written again, without NaN.
+            json.dumps(earlier, allow_nan=False)
             if earlier["format"] != FORMAT:
                 raise ValueError(f"its format is {earlier['format']!r}, expected {FORMAT}")
             sources = [{key: source[key] for key in ("name", "n_instances", "sha256")} for source in earlier["instances"]]
@@ -137,7 +140,7 @@ class EvaluationFolder:
             versions = dict(earlier["runs"][-1]["versions"])
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"{path}: does not describe the {RESULTS_FILE} beside it ({one_line(error)}); {remedy}."
+                f"{path}: does not describe the {RESULTS_FILE} beside it ({one_line(error):.300}); {remedy}."
             ) from error
         if shard != settings.get("shard"):
             raise ValueError(
@@ -146,7 +149,7 @@ class EvaluationFolder:
         # Instances are numbered through all sets, so that one list must be the beginning of the other.
         for before, now in zip(sources, settings["instances"], strict=False):
             if before != now:
-                pair = [f"{source['name']} ({source['n_instances']}, {source['sha256'][:8]})" for source in (before, now)]
+                pair = [f"{source['name']} ({source['n_instances']}, {str(source['sha256'])[:8]})" for source in (before, now)]
                 raise ValueError(
                     f"{self.folder}: holds results of other instances: {pair[0]}, not {pair[1]}; give the same "
                     f"files in the same order, {remedy}."

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from sb3_uav.common.json_text import parse_json
 
 RESULTS_FILE = "results.csv"
 SCHEDULES_FILE = "schedules.jsonl"
@@ -150,7 +151,7 @@ def damaged(path: Path, line: Line, what: object) -> ValueError:
     :return: The error to raise
     """
     return ValueError(
-        f"{path}, line {line.number}: is damaged ({what}); correct or delete that line, or start over with --overwrite."
+        f"{path}, line {line.number}: is damaged ({what!s:.300}); correct or delete that line, or start over with --overwrite."
     )
 
 
@@ -226,7 +227,7 @@ def iterate_schedules(path: Path) -> Iterator[tuple[Line, ResultKey]]:
         return
     for line in whole_lines(path):
         try:
-            record = json.loads(line.text)
+            record = parse_json(line.text)
             key = ResultKey(*(record[name] for name in ResultKey._fields))
             is_whole = type(key.instance) is int and type(key.seed) is int and type(key.solver) is str
             if not is_whole or type(key.time_limit) not in (int, float, type(None)):

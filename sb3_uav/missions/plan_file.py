@@ -87,7 +87,7 @@ def plan_from_json(data: Any, source: str) -> Plan:
     if not isinstance(data, dict) or data.get("format") != "sb3-uav mission":
         raise ValueError(f'{source}: this is not a plan of sb3-uav solve, which has "format": "sb3-uav mission".')
     if data.get("version") != _VERSION:
-        raise ValueError(f"{source}: version is {data.get('version')!r}, but this release reads {_VERSION}; plan anew.")
+        raise ValueError(f"{source}: version is {data.get('version')!r:.40}, but this release reads {_VERSION}; plan anew.")
     if data.get("system") not in get_args(System):
         raise ValueError(f"{source}: system is {data.get('system')!r:.40}; it is one of {', '.join(get_args(System))}.")
     try:
@@ -125,7 +125,8 @@ def plan_from_json(data: Any, source: str) -> Plan:
         bound = None if data.get("bound") is None else float(data["bound"])
         solver, seed, seconds = str(data["solver"]), int(data["seed"]), float(data["seconds"])
     except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise ValueError(f"{source}: {type(error).__name__} {error}; a part of the plan is missing or wrong.") from error
+        found = f"{type(error).__name__} {error}"
+        raise ValueError(f"{source}: {found:.300}; a part of the plan is missing or wrong.") from error
     if tasks.depot is None:
         raise ValueError(f"{source}: the plan has no depot; plan anew.")
     if tasks.system == "wgs84" and not (np.abs(tasks.depot) <= (90.0, 180.0)).all():
@@ -141,6 +142,9 @@ def plan_from_json(data: Any, source: str) -> Plan:
         plan = make_plan(tasks, fleet, schedule, solver, seed, seconds)
     except InfeasibleScheduleError as error:
         raise InfeasibleScheduleError(f"{source}: {error}") from error
+    except ValueError as error:
+        # It names the file of the tasks, if it names one.
+        raise ValueError(f"{source}: {error}") from error
     if bound is not None and not plan.objective <= bound < np.inf:
         raise ValueError(f"{source}: bound is {bound:g}, but it is finite and at least {plan.objective:g}, the objective.")
     return replace(plan, bound=bound, past_tasks=past_tasks, past_uavs=past_uavs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 from collections.abc import Sequence
 from itertools import groupby
@@ -65,20 +66,26 @@ def _read_its_log(its_log: str | os.PathLike[str]) -> dict[str, list[_LoggedEpoc
     if not its_log.is_file():
         raise FileNotFoundError(f"{its_log}: no such log; give the its_log.csv of a run of the interactive training strategy.")
     epochs: dict[str, list[_LoggedEpoch]] = {level: [] for level in _LEVELS}
-    with its_log.open(newline="", encoding="utf-8") as file:
+    try:
+        text = its_log.read_text(encoding="utf-8")
+        # Read here, because what is no CSV may stand in any line.
+        list(csv.reader(io.StringIO(text, newline="")))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{its_log}: is no CSV in UTF-8 ({error}); copy it again from its run.") from error
+    with io.StringIO(text, newline="") as file:
         reader = csv.DictReader(file)
         missing = _COLUMNS - set(reader.fieldnames or ())
         if missing:
-            raise ValueError(f"{its_log}: columns {sorted(missing)} are missing; found {reader.fieldnames}.")
+            raise ValueError(f"{its_log}: columns {sorted(missing)} are missing; found {reader.fieldnames!s:.200}.")
         for row in reader:
             where = f"{its_log}, line {reader.line_num}"
             if row["level"] not in epochs:
-                raise ValueError(f"{where}: level is {row['level']!r}, expected one of {_LEVELS}.")
+                raise ValueError(f"{where}: level is {row['level']!r:.80}, expected one of {_LEVELS}.")
             phase = _SPELLINGS.get(row["phase"], row["phase"])
             try:
                 epochs[row["level"]].append(_LoggedEpoch(int(row["epoch"]), phase, float(row["objective"])))
             except (TypeError, ValueError) as error:
-                found = f"{row['epoch']!r} and {row['objective']!r}"
+                found = f"{row['epoch']!r:.80} and {row['objective']!r:.80}"
                 raise ValueError(f"{where}: epoch and objective must be numbers, found {found}.") from error
     if not any(epochs.values()):
         raise ValueError(f"{its_log}: holds no epochs yet; wait until the first one has finished.")

@@ -54,8 +54,12 @@ class NetworkSettings:
             raise ValueError(f"normalization is {self.normalization!r}; choose one of {_NORMALIZATIONS}.")
         for name, least in (("embed_dim", 1), ("n_layers", 0), ("n_heads", 1), ("ff_dim", 1), ("bias_dim", 1)):
             value = getattr(self, name)
-            if not isinstance(value, Integral) or value < least:
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
                 raise ValueError(f"{name} is {value!r}; give a whole number, at least {least}.")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, bool) and not isinstance(value, bool):
+                raise ValueError(f"{field.name} is {value!r}; give True or False.")
         if self.embed_dim % self.n_heads != 0:
             raise ValueError(f"embed_dim {self.embed_dim} must be a multiple of n_heads {self.n_heads}.")
         lacking = [name for name in ("relative", "geometry", "shared_scorer") if self.whole and not getattr(self, name)]

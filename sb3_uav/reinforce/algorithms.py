@@ -30,7 +30,7 @@ def resolve_algorithm(name: str, what: str = "router: algo") -> type[OnPolicyAlg
         algorithm = import_object(name)
     except ValueError as error:
         choices = ", ".join(ALGORITHMS)
-        raise ValueError(f"{what} is {name!r}; choose one of {choices} or give a dotted path.") from error
+        raise ValueError(f"{what} is {name!r:.80}; choose one of {choices} or give a dotted path.") from error
     if not (isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)):
         raise ValueError(f"{what} {name!r} is not an on-policy algorithm of SB3.")
     return algorithm

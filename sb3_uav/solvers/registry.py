@@ -60,7 +60,7 @@ def solver_factory(spec: str) -> Callable[..., Solver]:
     """
     name = spec.partition(":")[0]
     if name not in SOLVERS:
-        raise ValueError(f"Unknown solver {name!r}; choose one of {sorted(SOLVERS)}.")
+        raise ValueError(f"Unknown solver {name!r:.80}; choose one of {sorted(SOLVERS)}.")
     module, _, attribute = SOLVERS[name].partition(":")
     return getattr(import_module(module), attribute)
 
@@ -93,7 +93,8 @@ def _split_options(text: str) -> list[str]:
             quoted = re.match(f"{quote}((?:[^{quote}]|{quote}{quote})*){quote}(,|$)", value)
             if quoted is None:
                 raise ValueError(
-                    f"The value of {text!r} begins with a quote; end it with another one, followed by a comma or by nothing."
+                    f"The value of {text!r:.200} begins with a quote; end it with another one, followed by a comma or by "
+                    "nothing."
                 )
             items.append(plain[0] + quoted[1].replace(quote * 2, quote))
             text = value[quoted.end() :]
@@ -119,10 +120,10 @@ def _parse_options(name: str, text: str, factory: Callable[..., Solver], default
     for item in _split_options(text):
         key, equals, value = item.partition("=")
         if not equals or key not in choices:
-            raise ValueError(f"Solver {name!r} has no option {item!r}; its options are: {known}.")
+            raise ValueError(f"Solver {name!r} has no option {item!r:.200}; its options are: {known}.")
         if key in options:
             raise ValueError(f"Solver {name!r} is given the option {key!r} twice.")
-        options[key] = _parse_value(f"Option {item!r} of solver {name!r}", value, choices[key])
+        options[key] = _parse_value(f"Option {item!r:.200} of solver {name!r}", value, choices[key])
     # The label is no argument of the solver.
     options.pop("name", None)
     options = {key: value for key, value in defaults.items() if key in parameters} | options

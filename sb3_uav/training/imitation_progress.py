@@ -13,6 +13,8 @@ import torch as th
 
 from sb3_uav.common import distributed
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.tensor_files import load_tensors
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import RouterPolicy
 
@@ -125,12 +127,10 @@ class ImitationProgress:
     def _read(self, path: Path, rng: np.random.Generator) -> dict[str, Any] | None:
         if not path.is_file():
             return None
-        stored = io.BytesIO(path.read_bytes())
         try:
-            content = th.load(stored, map_location="cpu", weights_only=True)
-            state, settings = json.loads(content["rng"]), content["settings"]
-        except Exception as error:
-            # Torch raises exceptions of many kinds here.
+            content = load_tensors(path.read_bytes())
+            state, settings = parse_json(content["rng"]), content["settings"]
+        except (LookupError, TypeError, ValueError) as error:
             raise self._damaged(path, error) from error
         if settings != self.settings:
             raise ValueError(

@@ -155,11 +155,11 @@ class SizeTable:
             reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
             rows = [{name: float(value) for name, value in row.items()} for row in reader]
         except (ValueError, TypeError, AttributeError, csv.Error) as error:
-            raise ValueError(f"{path}: not an intact table of numbers ({error}); delete it.") from error
+            raise ValueError(f"{path}: not an intact table of numbers ({error!s:.300}); delete it.") from error
         expected = ["updates", "seconds", *columns, "score"]
         for row in rows:
             if list(row) != expected:
-                raise ValueError(f"{path}: has columns {list(row)}, not {expected}; it belongs to other sizes.")
+                raise ValueError(f"{path}: has columns {list(row)!s:.300}, not {expected}; it belongs to other sizes.")
         return cls(rows)
 
     def text(self) -> str:

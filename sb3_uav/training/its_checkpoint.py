@@ -15,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.epoch_log import EpochRecord
 from sb3_uav.common.files import file_hash, write_atomically
+from sb3_uav.common.json_text import parse_json
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.generators import InstanceGenerator
@@ -148,8 +149,8 @@ def read_state(folder: Path, file: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
     try:
-        state = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
+        state = parse_json(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise _damaged(path, str(error)) from error
     if not isinstance(state, dict):
         raise _damaged(path, f"it holds {state!r:.40} in place of a mapping")

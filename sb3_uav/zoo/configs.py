@@ -5,16 +5,17 @@ from __future__ import annotations
 import difflib
 import inspect
 import re
+import reprlib
 from pathlib import Path
 from typing import Any
 
-import yaml
 from stable_baselines3.common.type_aliases import Schedule
 
 import sb3_uav
 from sb3_uav.common.sb3_compat import linear_schedule
 from sb3_uav.zoo.entries import find_entry
 from sb3_uav.zoo.rl_zoo3_compat import stock_config
+from sb3_uav.zoo.yaml_text import load_yaml
 
 # Keys that rl_zoo3 removes from a YAML entry before passing the rest to the algorithm (rl_zoo3/exp_manager.py).
 _ZOO_KEYS = {
@@ -41,18 +42,15 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")
-    try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    # ValueError: bytes that are no UTF-8, and dates that do not exist. RecursionError: brackets without end.
-    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML: {error}") from error
+    found = load_yaml(path)
     if not isinstance(found, dict):
         raise ValueError(f"{path}: holds {_kind(found)} instead of a mapping; write `name: settings`.")
     return found
 
 
 def _kind(value: Any) -> str:
-    return "nothing" if value is None else f"{value!r:.40} ({type(value).__name__})"
+    # Not by repr alone, which raises an error for whole numbers of thousands of digits.
+    return "nothing" if value is None else f"{reprlib.repr(value):.40} ({type(value).__name__})"
 
 
 def default_config(algo: str, env_id: str | None = None) -> Path | None:

@@ -151,9 +151,14 @@ class UAVExperimentManager(ExperimentManager):
             note_saved(model, Path(self.trained_agent))
         try:
             super().learn(model)
-        except (TypeError, OverflowError) as error:
+        except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
+        except ValueError as error:
+            # Others as well, those of the router above all, which is made then.
+            if str(self.config) in str(error):
+                raise
+            raise ValueError(f"{self._where}: {error}") from error
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         require_finite_model(model, self.save_path)

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from sb3_uav.zoo.yaml_text import load_yaml
+
 
 class _PlainLoader(yaml.SafeLoader):
     """Also reads ordered dictionaries and tuples, which rl_zoo3 writes with tags of Python."""
@@ -34,10 +36,7 @@ def read_saved(path: Path) -> dict[str, Any]:
     :return: Its content
     :raises ValueError: If it cannot be read, or names an object of Python; the message names the file
     """
-    try:
-        found = yaml.load(path.read_text(encoding="utf-8"), Loader=_PlainLoader)
-    except (yaml.YAMLError, OSError, ValueError, AssertionError, RecursionError) as error:
-        raise ValueError(f"{path}: cannot be read as plain YAML: {error}") from error
+    found = load_yaml(path, _PlainLoader)
     if not isinstance(found, dict):
         raise ValueError(f"{path}: holds no mapping; it was not written by rl_zoo3.")
     return found

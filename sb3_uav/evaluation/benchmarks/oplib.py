@@ -27,7 +27,7 @@ class UnsupportedMetricError(ValueError):
 
     def __init__(self, path: Path, metric: str) -> None:
         super().__init__(
-            f"{path}: EDGE_WEIGHT_TYPE is {metric}; only {_METRIC} can be solved; take the file out of the folder."
+            f"{path}: EDGE_WEIGHT_TYPE is {metric:.60}; only {_METRIC} can be solved; take the file out of the folder."
         )
         self.path = path
         self.metric = metric
@@ -57,9 +57,11 @@ def read_oplib(path: Path, text: str, group: str) -> BenchmarkInstance:
         metric = _specification(text, "EDGE_WEIGHT_TYPE")
         if metric not in ("", _METRIC):
             raise UnsupportedMetricError(path, metric) from error
-        raise ValueError(f"{path}: is no intact OPLib file ({error or type(error).__name__}); {_REMEDY}.") from error
+        raise ValueError(
+            f"{path}: is no intact OPLib file ({str(error)[:300] or type(error).__name__}); {_REMEDY}."
+        ) from error
     if str(fields.get("type")).upper() != "OP":
-        raise ValueError(f"{path}: TYPE is {fields.get('type', 'missing')}; only OP can be solved; {_REMEDY}.")
+        raise ValueError(f"{path}: TYPE is {fields.get('type', 'missing')!s:.60}; only OP can be solved; {_REMEDY}.")
     if fields.get("edge_weight_type") != _METRIC:
         raise UnsupportedMetricError(path, str(fields.get("edge_weight_type", "missing")))
     limit = _number(path, fields, "cost_limit")
