@@ -155,7 +155,7 @@ def test_interrupting(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
     monkeypatch.setitem(registry.SOLVERS, "interrupted", "evaluate_cli_helpers:Interrupted")
     assert bench(tmp_path, "--solvers", "random-nearest", *CHAO) == 0
     assert bench(tmp_path, "--solvers", "random-nearest", "interrupted", *CHAO) == 130
-    assert f"{tmp_path} holds the results so far; run the same command again to resume." in capsys.readouterr().err
+    assert "sb3-uav bench: interrupted; continue with sb3-uav bench " in capsys.readouterr().err
     # These describe the results before; those are kept.
     assert not (tmp_path / "gaps.csv").exists() and not (tmp_path / "summary.md").exists()
     assert len(read_results(tmp_path / "results.csv")) == 5

@@ -30,8 +30,10 @@ def test_resuming_after_ctrl_c(
     monkeypatch.setitem(SOLVERS, "halting", "evaluate_cli_helpers:Interrupted")
     assert run(*common, "halting") == 130
     message = capsys.readouterr().err
-    assert f"{tmp_path} holds the results so far; run the same command again to resume" in message
-    assert message.endswith("sb3-uav evaluate: interrupted\n")
+    line = message.splitlines()[-1]
+    assert (
+        line.startswith("sb3-uav evaluate: interrupted; continue with sb3-uav evaluate --instances ") and str(tmp_path) in line
+    )
     before = (tmp_path / "results.csv").read_text()
     assert [row["solver"] for row in read_results(tmp_path)] == ["random-nearest"] * 4
 

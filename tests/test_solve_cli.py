@@ -16,8 +16,8 @@ import pytest
 
 import sb3_uav.missions
 from sb3_uav.cli import main as cli
-from sb3_uav.cli.interrupt import ends_at_once
 from sb3_uav.cli.mission_report import Progress, exit_code, print_plan, why_empty
+from sb3_uav.common.interruption import ends_at_once
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.missions import Fleet, Plan, TaskList, Uav, load_plan, solve
 from sb3_uav.missions.fleet_options import FleetOptions

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_uav.cli.solver_specs import add_run_options, solvers_of
+from sb3_uav.common.interruption import continued_by
 from sb3_uav.common.optional import install_command, require
 
 if TYPE_CHECKING:
@@ -148,7 +149,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that the run needs is not installed
     """
-    args = _make_parser().parse_args(argv)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    args = _make_parser().parse_args(arguments)
+    again = ["sb3-uav", "bench", *(word for word in arguments if word != "--overwrite")]
     from sb3_uav.cli.shards import run_shard
     from sb3_uav.evaluation.benchmarks import read_best_known, read_folder
     from sb3_uav.evaluation.benchmarks.run import compare_results, run_benchmark
@@ -173,25 +176,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     }
 
     def run(shard: Shard, out: Path) -> list[GapRow]:
-        try:
-            with _Progress(_n_results(solvers, benchmark, time_limits, shard)) as progress:
-                return run_benchmark(
-                    solvers,
-                    benchmark,
-                    best_known,
-                    out,
-                    args.seed,
-                    progress,
-                    time_limits=time_limits,
-                    n_jobs=args.jobs,
-                    resume=not args.overwrite,
-                    use_rounding=args.use_rounding,
-                    shard=shard,
-                    about={"benchmark": about},
-                )
-        except KeyboardInterrupt:
-            print(f"sb3-uav: {out} holds the results so far; run the same command again to resume.", file=sys.stderr)
-            raise
+        with _Progress(_n_results(solvers, benchmark, time_limits, shard)) as progress, continued_by(again):
+            return run_benchmark(
+                solvers,
+                benchmark,
+                best_known,
+                out,
+                args.seed,
+                progress,
+                time_limits=time_limits,
+                n_jobs=args.jobs,
+                resume=not args.overwrite,
+                use_rounding=args.use_rounding,
+                shard=shard,
+                about={"benchmark": about},
+            )
 
     def join(folders: Sequence[Path], out: Path) -> list[GapRow]:
         merge(folders, out, args.overwrite)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.interruption import continued_by
 from sb3_uav.common.optional import require
 from sb3_uav.zoo.dependencies import require_zoo
 
@@ -75,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from sb3_uav.studies.compare.study import Settings, run_study
 
     report_only = settings.pop("report_only")
-    for path in run_study(Settings(**settings), arguments, report_only):
-        print(path)
+    with continued_by(["sb3-uav", "compare", *arguments]):
+        for path in run_study(Settings(**settings), arguments, report_only):
+            print(path)
     return 0

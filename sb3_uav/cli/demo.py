@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_uav.common.interruption import Interruption, without_option
 from sb3_uav.common.optional import require
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id, ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
@@ -23,6 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises ValueError: If an argument is wrong
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that the demo needs is not installed
+    :raises Interruption: After Ctrl-C, with the command that continues
     """
     parser = argparse.ArgumentParser(prog="sb3-uav demo", description=_DESCRIPTION)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder of all results (default: %(default)s)")
@@ -36,18 +38,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     require("matplotlib.figure", "The demo", "plots")
     ensure_registered(args.env)
     from sb3_uav.studies.demo import evaluate_run, newest_run
+    from sb3_uav.zoo.checkpoints import newest_checkpoint
     from sb3_uav.zoo.train import train
 
     logs = args.out / "logs"
-    train(
-        [
-            *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
-            *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
-            *("--eval-freq", "1000000", "--eval-episodes", "50"),
-            # Networks this small gain little from a second thread, and lose much if another process needs the core.
-            *("--num-threads", "1"),
-            *(["--progress"] if sys.stdout.isatty() else []),
-            *train_args,
-        ]
-    )
-    return evaluate_run(newest_run(logs / "reinforce", args.env), args.env, args.out, args.n_instances, args.seed)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        train(
+            [
+                *("--algo", "reinforce", "--env", args.env, "--log-folder", str(logs), "--seed", str(args.seed)),
+                *("--tensorboard-log", str(args.out / "tensorboard"), "--log-interval", "200"),
+                *("--eval-freq", "1000000", "--eval-episodes", "50"),
+                # Networks this small gain little from a second thread, and lose much if another process needs the core.
+                *("--num-threads", "1"),
+                *(["--progress"] if sys.stdout.isatty() else []),
+                *train_args,
+            ]
+        )
+    except Interruption as error:
+        raise _continued(arguments, error.changes) from error
+    run = newest_run(logs / "reinforce", args.env)
+    try:
+        return evaluate_run(run, args.env, args.out, args.n_instances, args.seed)
+    except KeyboardInterrupt as error:
+        # A training that is complete ends at once.
+        raise _continued(arguments, ("-i", str(newest_checkpoint(run)))) from error
+
+
+def _continued(arguments: Sequence[str], changes: Sequence[str]) -> Interruption:
+    kept = without_option(arguments, ("-i", "--trained-agent")) if changes else arguments
+    return Interruption(["sb3-uav", "demo", *kept, *changes])

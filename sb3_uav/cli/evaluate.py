@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_uav.cli.solver_specs import add_run_options, solvers_of
+from sb3_uav.common.interruption import continued_by
 from sb3_uav.common.optional import install_command
 
 if TYPE_CHECKING:
@@ -200,7 +201,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that evaluations need is not installed
     """
-    args = _make_parser().parse_args(argv)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    args = _make_parser().parse_args(arguments)
+    again = ["sb3-uav", "evaluate", *(word for word in arguments if word != "--overwrite")]
     from sb3_uav.cli.shards import run_shard
     from sb3_uav.evaluation.instance_sets import files_of
     from sb3_uav.evaluation.merge import merge
@@ -216,23 +219,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     reference = find_reference(solvers, args.reference)
 
     def run(shard: Shard, out: Path) -> list[SummaryRow]:
-        try:
-            with ProgressLines() as progress:
-                return evaluate(
-                    solvers,
-                    instances,
-                    out,
-                    args.seed,
-                    progress,
-                    time_limits=args.time_limit or (None,),
-                    n_jobs=args.jobs,
-                    reference=reference,
-                    resume=not args.overwrite,
-                    shard=shard,
-                )
-        except KeyboardInterrupt:
-            print(f"sb3-uav: {out} holds the results so far; run the same command again to resume.", file=sys.stderr)
-            raise
+        with ProgressLines() as progress, continued_by(again):
+            return evaluate(
+                solvers,
+                instances,
+                out,
+                args.seed,
+                progress,
+                time_limits=args.time_limit or (None,),
+                n_jobs=args.jobs,
+                reference=reference,
+                resume=not args.overwrite,
+                shard=shard,
+            )
 
     summary = run_shard(args, run, partial(merge, overwrite=args.overwrite))
     return _OK if summary is None else report_summary(summary)

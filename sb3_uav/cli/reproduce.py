@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_uav.common.interruption import continued_by
 from sb3_uav.common.optional import require
 from sb3_uav.reproduce.scales import SCALES
 from sb3_uav.reproduce.targets import DEFAULT_SOLVERS, TARGETS, check_solvers, target_functions
@@ -130,16 +131,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     require_zoo("Reproducing the paper's tables")
     from sb3_uav.cli.evaluate import ProgressLines
 
-    try:
-        with ProgressLines() as progress:
-            session = _make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
-            for position, name in enumerate(names):
-                print(f"{name} ({position + 1} of {len(names)}), scale {args.scale}", file=sys.stderr, flush=True)
-                for path in target_functions()[name](session):
-                    print(path, flush=True)
-    except KeyboardInterrupt:
-        print(f"sb3-uav: {out} holds the results so far; rerun the command to resume.", file=sys.stderr)
-        raise
+    with ProgressLines() as progress, continued_by(["sb3-uav", "reproduce", *arguments]):
+        session = _make_session(args, out, shlex.join(["sb3-uav", "reproduce", *arguments]), progress)
+        for position, name in enumerate(names):
+            print(f"{name} ({position + 1} of {len(names)}), scale {args.scale}", file=sys.stderr, flush=True)
+            for path in target_functions()[name](session):
+                print(path, flush=True)
     return 0
 
 

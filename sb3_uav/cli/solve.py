@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
-from sb3_uav.cli.interrupt import ends_at_once
+from sb3_uav.common.interruption import ends_at_once
 from sb3_uav.common.optional import require
 from sb3_uav.missions.flight import Firmware, FlightOptions, Landing, Vehicle
 
@@ -151,7 +151,8 @@ def main(argv: Sequence[str]) -> int:
     tasks = read_tasks(args.tasks, unit=args.unit, depot=args.depot, allow_duplicates=args.allow_duplicates, row=args.row)
     options = FleetOptions(args.fleet, args.uavs, args.range, args.endurance, args.speed, args.reserve)
     fleet = options.fleet(tasks)
-    with Progress(args.time_limit) as progress, ends_at_once("sb3-uav solve", progress.end):
+    again = ["sb3-uav", "solve", *argv]
+    with Progress(args.time_limit) as progress, ends_at_once("sb3-uav solve", progress.end, again):
         try:
             plan = solve(tasks, fleet, args.solver, args.time_limit, args.seed, progress, progress.begin)
         except NoScheduleError as error:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+from sb3_uav.common.interruption import Interruption, exit_code, interruptible, interruption_line
+
 _LONGEST_MESSAGE = 3000
-_OK, _USER_ERROR, _INTERRUPTED = 0, 2, 130
+_OK, _USER_ERROR = 0, 2
 
 
 def run_command(prog: str, function: Callable[[], int | None]) -> int:
@@ -15,16 +17,18 @@ def run_command(prog: str, function: Callable[[], int | None]) -> int:
 
     :param prog: Name of the command, which the line begins with
     :param function: The command; None stands for the exit code 0
-    :return: Exit code: that of the command (0 on success), 2 if the input was wrong, 130 after Ctrl-C
+    :return: Exit code: that of the command (0 on success), 2 if the input was wrong, 130 after Ctrl-C, 143 after
+        SIGTERM
     """
     try:
-        return function() or _OK
+        with interruptible():
+            return function() or _OK
     except (ValueError, OSError, ImportError) as error:
         print(f"{prog}: error: {_shortened(' '.join(str(error).split()))}", file=sys.stderr)
         return _USER_ERROR
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+    except KeyboardInterrupt as error:
+        print(interruption_line(prog, error.words if isinstance(error, Interruption) else ()), file=sys.stderr)
+        return exit_code()
 
 
 def _shortened(text: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.common.interruption import is_interruption
 from sb3_uav.evaluation.provenance import describe_machine
 from sb3_uav.reproduce.scales import Recipe, Scale, Scenario, scenarios
 from sb3_uav.training.its_schedule import INDEPENDENT, EpochSchedule, strategy_name
@@ -144,8 +145,7 @@ def train_pair(job: PairTraining) -> None:
         _run_zoo(job, config, run)
         run = job.newest_run()
     if run is None or (state := read_state(run / CHECKPOINT_FOLDER))["epoch"] < job.schedule.n_epochs:
-        # rl_zoo3 treats Ctrl-C as the end of the training.
-        raise KeyboardInterrupt
+        raise TrainingError(f"Training {job.title} ended early (all of its output is in {job.run_folder / _OUTPUT_FILE})")
     _publish(job, run, state)
 
 
@@ -155,6 +155,7 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     :param config: Its YAML
     :param interrupted: The zoo's folder of the run to resume
     :raises TrainingError: If it fails
+    :raises KeyboardInterrupt: If it was interrupted
     """
     from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, read_state
     from sb3_uav.zoo import train as zoo_train
@@ -169,6 +170,8 @@ def _run_zoo(job: PairTraining, config: Path, interrupted: Path | None) -> None:
     output = job.run_folder / _OUTPUT_FILE
     with output.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
         code = zoo_train.main(arguments)
+    if is_interruption(code):
+        raise KeyboardInterrupt
     if code != 0:
         last = output.read_text(encoding="utf-8").strip().splitlines()[-1:]
         raise TrainingError(f"Training {job.title} failed: {''.join(last)} (all of its output is in {output})")

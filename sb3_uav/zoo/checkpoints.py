@@ -76,6 +76,21 @@ def find_checkpoint(trained_agent: Path) -> Path | None:
     return next((folder for folder in (beside, below) if (folder / STATE_FILE).is_file()), None)
 
 
+def newest_checkpoint(folder: Path) -> Path | None:
+    """
+    :param folder: rl_zoo3's folder of a run
+    :return: The zip from which ``train -i`` continues it, if something has been saved: the allocator of the last epoch of ITS,
+        else the last checkpoint of ``--save-freq``
+    """
+    try:
+        below = folder / CHECKPOINT_FOLDER
+        return below / read_state(below)["allocator"]
+    except FileNotFoundError:
+        numbered = {_MODEL_FILE.fullmatch(path.name): path for path in folder.glob("rl_model_*_steps.zip")}
+        steps = {int(match.group(1)): path for match, path in numbered.items() if match is not None}
+        return steps[max(steps)] if steps else None
+
+
 def find_router(allocator: Path) -> Path | None:
     """
     :param allocator: The allocator's zip

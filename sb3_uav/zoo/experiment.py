@@ -17,13 +17,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common import distributed
 from sb3_uav.common.divergence import note_saved, require_finite_model
+from sb3_uav.common.interruption import Interruption
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback, StopAtDivergence
-from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint, newest_checkpoint
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
@@ -149,8 +150,9 @@ class UAVExperimentManager(ExperimentManager):
         watch(model)
         if self.continue_training:
             note_saved(model, Path(self.trained_agent))
+        noted = _InterruptionNoted(model)
         try:
-            super().learn(model)
+            super().learn(noted)  # type: ignore[arg-type]
         except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
@@ -159,6 +161,9 @@ class UAVExperimentManager(ExperimentManager):
             if str(self.config) in str(error):
                 raise
             raise ValueError(f"{self._where}: {error}") from error
+        if noted.interruption is not None:
+            checkpoint = newest_checkpoint(Path(self.save_path))
+            raise Interruption((), () if checkpoint is None else ("-i", str(checkpoint))) from noted.interruption
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         require_finite_model(model, self.save_path)
@@ -297,6 +302,31 @@ class UAVExperimentManager(ExperimentManager):
         """The interactive training strategy of this run, if it has one."""
         found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
         return found[0] if found else None
+
+
+class _InterruptionNoted:
+    """
+    An algorithm whose interruption is noted: rl_zoo3 takes Ctrl-C for the end of the training, and saves the final model.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L254
+
+    :param model: The algorithm
+    """
+
+    def __init__(self, model: BaseAlgorithm) -> None:
+        self.model = model
+        self.interruption: KeyboardInterrupt | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.model, name)
+
+    def learn(self, *args: Any, **kwargs: Any) -> None:
+        """:raises KeyboardInterrupt: After noting it"""
+        try:
+            self.model.learn(*args, **kwargs)
+        except KeyboardInterrupt as error:
+            self.interruption = error
+            raise
 
 
 def _described(error: Exception) -> str:

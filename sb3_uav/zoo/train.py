@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common import distributed
 from sb3_uav.common.errors import main_function
+from sb3_uav.common.interruption import Interruption, without_option
 from sb3_uav.common.optional import require
 from sb3_uav.common.random_streams import draw_seed
 from sb3_uav.pretrained import names
@@ -36,6 +38,7 @@ def train(arguments: Sequence[str]) -> None:
     :raises ValueError: If an argument or the YAML is wrong
     :raises OSError: If a file cannot be read or written
     :raises ImportError: If a package that training needs is not installed
+    :raises Interruption: After Ctrl-C, with the command that continues
     """
     if not distributed.is_launched():
         _train(arguments)
@@ -67,6 +70,7 @@ def _train(arguments: Sequence[str]) -> None:
     parser.add_argument("--trust", action="store_true")
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
+    given = list(arguments)
     arguments = [argument for argument in arguments if argument != "--trust"]
     require_zoo("Training from YAML")
     if known.progress:
@@ -102,21 +106,45 @@ def _train(arguments: Sequence[str]) -> None:
     defaults = []
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
-    with experiment_manager(UAVExperimentManager), command_line(_PROG, ["--algo", known.algo, *defaults, *arguments, *agent]):
+    words = ["--algo", known.algo, *defaults, *arguments, *agent]
+    with experiment_manager(UAVExperimentManager), command_line(_PROG, words), _readable_errors():
         try:
             rl_zoo3.train.train()
-        except AssertionError as error:
-            # rl_zoo3 raises it for wrong arguments.
-            raise ValueError(str(error)) from error
-        except FileNotFoundError:
+        except Interruption as error:
+            raise _continued(given, known.trained_agent, error.changes) from error
+
+
+@contextmanager
+def _readable_errors() -> Iterator[None]:
+    """Turn errors of rl_zoo3 and of what it calls into those that commands report."""
+    try:
+        yield
+    except AssertionError as error:
+        # rl_zoo3 raises it for wrong arguments.
+        raise ValueError(str(error)) from error
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise OSError(f"could not write: {error}. Earlier files are intact.") from error
+    except Exception as error:
+        # wandb is not imported here, so that its classes cannot be named.
+        if type(error).__module__.partition(".")[0] != "wandb":
             raise
-        except OSError as error:
-            raise OSError(f"could not write: {error}. Earlier files are intact.") from error
-        except Exception as error:
-            # wandb is not imported here, so that its classes cannot be named.
-            if type(error).__module__.partition(".")[0] != "wandb":
-                raise
-            raise ValueError(f"--track: {error} Or set WANDB_MODE=offline.") from error
+        raise ValueError(f"--track: {error} Or set WANDB_MODE=offline.") from error
+
+
+def _continued(arguments: Sequence[str], trained_agent: str | None, changes: Sequence[str]) -> Interruption:
+    """
+    :param arguments: Of the interrupted command
+    :param trained_agent: Its ``-i``
+    :param changes: That of the command that continues; empty if nothing was saved
+    :return: What says how to go on
+    """
+    if not changes:
+        # From where it began.
+        return Interruption([] if trained_agent is None else [*_PROG.split(), *arguments])
+    kept = without_option(arguments, ("-i", "--trained-agent"))
+    return Interruption([*_PROG.split(), *kept, *changes], changes)
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.

@@ -6,16 +6,15 @@ import json
 import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.interruption import interruptible
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory
 
 FINISHED_FILE = "finished.json"
@@ -118,7 +117,7 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
     waiting = list(trainings)
     running: list[tuple[ZooTraining, subprocess.Popen[bytes], float]] = []
     failures: list[str] = []
-    with _termination_as_interrupt():
+    with interruptible():
         try:
             while waiting or running:
                 while waiting and len(running) < n_jobs:
@@ -138,13 +137,3 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
                 process.wait()
     if failures:
         raise ValueError(f"{len(failures)} of {len(trainings)} trainings failed: {'; '.join(failures)}")
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt, so that `finally` blocks are run."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
