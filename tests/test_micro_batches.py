@@ -1,12 +1,17 @@
 """Micro-batches: the same update with less memory."""
 
+import re
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
-from reinforce_models import SMALL, make_env, make_model
+from reinforce_models import SMALL, assert_equal_parameters, make_env, make_model
+from stable_baselines3.common.logger import Logger
 
-from sb3_uav.reinforce import REINFORCE
+from sb3_uav.envs import UniformGenerator
+from sb3_uav.policies import memory
+from sb3_uav.reinforce import REINFORCE, memory_estimate, micro_batches
 
 
 def gradient(level: str, baseline: str, micro_batch_size: int | None, **kwargs: Any) -> tuple[th.Tensor, Any]:
@@ -62,3 +67,71 @@ def test_it_is_kept_in_zips(tmp_path):
     model = make_model(micro_batch_size=3)
     model.save(tmp_path / "model.zip")
     assert REINFORCE.load(tmp_path / "model.zip", env=make_env()).micro_batch_size == 3
+
+
+# ------------------------------------------------------------------------------------------ memory
+
+
+def test_micro_batches_are_chosen_when_the_batch_does_not_fit(monkeypatch):
+    """Said in one line before the first update; the update is the same."""
+    env = make_env("router", n_envs=40, n_tasks=30)
+    whole = make_model("router", env=env).learn_instances(80)
+    needed = memory_estimate.update_bytes(whole._micro_batches.per_instance, 40)
+    monkeypatch.setattr(micro_batches, "available_memory", lambda device: round(0.99 * needed / 0.8))
+    tight = make_model("router", env=make_env("router", n_envs=40, n_tasks=30))
+    message = (
+        r"^router: an update of 40 instances of 30 tasks, 3 samples each, needs about 0\.\d\d GiB of memory; 0\.\d\d GiB "
+    )
+    with pytest.warns(
+        UserWarning, match=message + r"are available; its gradient is computed in micro-batches of \d+, which"
+    ) as w:
+        tight.learn_instances(80)
+    assert len(w) == 1
+    for name, value in whole.policy.state_dict().items():
+        th.testing.assert_close(tight.policy.state_dict()[name], value, atol=1e-4, rtol=1e-3)
+
+
+def test_batch_normalization_gets_another_remedy(monkeypatch):
+    monkeypatch.setattr(micro_batches, "available_memory", lambda device: 2**20)
+    model = make_model("router", env=make_env("router", 40, 30), policy_kwargs=dict(SMALL, preset="paper"))
+    with pytest.warns(UserWarning, match="batch normalization forbids micro-batches: lower n_envs to about 1"):
+        model.learn_instances(40)
+
+
+def test_the_estimate_is_printed_and_changes_nothing(capsys, monkeypatch):
+    spoken = make_model("allocator", env=make_env("allocator", 40, 30), verbose=1)
+    spoken.set_logger(Logger(None, []))
+    spoken.learn_instances(40)
+    assert re.search(
+        r"^allocator: an update of 40 instances of 30 tasks, .* GiB are available\.$", capsys.readouterr().out, re.M
+    )
+    monkeypatch.setattr(micro_batches, "_SMALL", 10**9)
+    silent = make_model("allocator", env=make_env("allocator", 40, 30)).learn_instances(40)
+    assert_equal_parameters(spoken, silent)
+    assert spoken.policy.features_extractor.n_encoded_rows == silent.policy.features_extractor.n_encoded_rows
+
+
+@pytest.mark.parametrize("level", ["allocator", "router"])
+def test_the_estimate_counts_what_the_gradient_pass_keeps(level):
+    """Twice the samples keep about twice as much; parameters are not counted."""
+    policy = make_model(level).policy
+    instances = UniformGenerator(30, 2 if level == "allocator" else 1)(4, np.random.default_rng(0))
+    few, many = (memory_estimate.bytes_per_instance(policy, instances, n) for n in (16, 32))
+    assert 1.6 * few < many < 2.4 * few
+    # At least one float32 of a node embedding for each sample and step of the allocator.
+    assert many > 32 * 30 * 16 * 4
+
+
+def test_the_limits_of_a_container_count(tmp_path, monkeypatch):
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory._free_of_the_group(tmp_path) is None
+    (tmp_path / "memory.max").write_text("3000\n")
+    (tmp_path / "memory.current").write_text("1000\n")
+    assert memory._free_of_the_group(tmp_path) == 2000
+    monkeypatch.setattr(memory, "_free_of_the_group", lambda: 2000)
+    monkeypatch.setattr(memory, "_free_of_the_system", lambda: None)
+    assert memory.available_memory(th.device("cpu")) == 2000
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert memory.available_memory(th.device("cpu")) == 1000
+    monkeypatch.setattr(memory, "_free_of_the_group", lambda: None)
+    assert memory.available_memory(th.device("cpu")) is None

@@ -293,7 +293,7 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         # In training mode and with gradients: the gradient pass uses this encoding too, so that batch normalization acts and
         # learns with the same statistics.
         self.policy.set_training_mode(True)
-        size = self._micro_batches.size(self, len(instances))
+        size = self._micro_batches.size(self, instances)
         cache = self.policy.encode(instances) if size is None else encode_in_parts(self.policy, instances, size)
         actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
         with th.no_grad():
