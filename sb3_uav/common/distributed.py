@@ -270,8 +270,21 @@ def sum_with_gradient(tensor: th.Tensor) -> th.Tensor:
     :param tensor: Of the same shape on all ranks
     :return: The sum over all ranks, through which gradients flow back to each of them
     """
-    if world_size() == 1:
-        return tensor
-    from torch.distributed.nn.functional import all_reduce
+    return tensor if world_size() == 1 else _Sum.apply(tensor)
 
-    return all_reduce(tensor)
+
+class _Sum(th.autograd.Function):
+    """The sum over all ranks. Torch's own functions for this are deprecated or private."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: th.Tensor) -> th.Tensor:
+        summed = tensor.detach().clone(memory_format=th.contiguous_format)
+        dist.all_reduce(summed)
+        return summed
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
+        # Each rank's part is in the sum of every rank.
+        summed = gradient.clone(memory_format=th.contiguous_format)
+        dist.all_reduce(summed)
+        return summed
