@@ -6,7 +6,8 @@ The processes share the batch, so that an update is the same whatever their numb
 router with the entry's network; the router learns on whole instances of 20 tasks, as many as a UAV has in its subset. The
 numbers of processes take turns, and ratios are those of each round, so that what other programs take on the machine meets
 both. Their median and range are printed, and the load average before and after. On a busy machine the CPU seconds of all
-processes tell more: twice the instances per CPU second, relative to one process, is the most that two cores can reach.
+processes tell more: twice the instances per CPU second, relative to one process, is the most that two cores can reach. The
+last lines tell how long an epoch of the allocator and one of the router take together.
 
     python benchmarks/distributed.py --processes 1 2 --rounds 5
 """
@@ -60,13 +61,24 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in given.items() if name not in _NOT_OF_THE_ALGORITHM}
 
 
+def _entry() -> tuple[dict[str, Any], dict[str, Any]]:
+    """:return: The entry of the YAML, and the arguments of its ITSCallback"""
+    entry = read_yaml(_CONFIG)[_ENTRY]
+    return entry, next(value for callback in entry["callback"] for name, value in callback.items() if "ITS" in name)
+
+
+def _epoch(level: str) -> int:
+    """:return: Instances of an epoch of this level"""
+    entry, its = _entry()
+    return its["router_instances_per_epoch"] if level == "router" else entry["instances_per_epoch"]
+
+
 def make(level: str) -> REINFORCE:
     """
     :param level: ``"allocator"`` or ``"router"``
     :return: Its algorithm, as the entry sets it
     """
-    entry = read_yaml(_CONFIG)[_ENTRY]
-    its = next(value for callback in entry["callback"] for name, value in callback.items() if "ITS" in name)
+    entry, its = _entry()
     if level == "router":
         env = BatchedVecEnv([lambda: RoutePlanningEnv(n_tasks=_N_TASKS // _N_UAVS)] * its["router"]["n_envs"])
         return REINFORCE(RouterPolicy, env, seed=1, device="cpu", **_settings(its["router"]))
@@ -120,6 +132,7 @@ def main() -> None:
                 Path(args.out).write_text(json.dumps(rate))
         return
     before = os.getloadavg()[0]
+    seconds = dict.fromkeys(args.processes, 0.0)
     for level in args.levels:
         rates: dict[int, list[tuple[float, float]]] = {n: [] for n in args.processes}
         for _ in range(args.rounds):
@@ -127,6 +140,7 @@ def main() -> None:
                 found.append(launch(n, level, args.updates))
         first = rates[args.processes[0]]
         for n, found in rates.items():
+            seconds[n] += _epoch(level) / median(rate[0] for rate in found)
             for unit, name in enumerate(("s", "CPU s")):
                 numbers, others = [rate[unit] for rate in found], [rate[unit] for rate in first]
                 ratios = [number / other for number, other in zip(numbers, others, strict=True)]
@@ -135,6 +149,10 @@ def main() -> None:
                     f"{max(numbers):.1f}), ratio {median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})",
                     flush=True,
                 )
+    for n, spent in seconds.items():
+        print(
+            f"an epoch of {' and one of '.join(args.levels)}, {n} processes: {spent:.1f} s, {seconds[args.processes[0]] / spent:.2f}"
+        )
     print(f"load average before {before:.1f}, after {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores")
 
 
