@@ -150,9 +150,8 @@ def main() -> None:
                     flush=True,
                 )
     for n, spent in seconds.items():
-        print(
-            f"an epoch of {' and one of '.join(args.levels)}, {n} processes: {spent:.1f} s, {seconds[args.processes[0]] / spent:.2f}"
-        )
+        ratio = seconds[args.processes[0]] / spent
+        print(f"an epoch of {' and one of '.join(args.levels)}, {n} processes: {spent:.1f} s, ratio {ratio:.2f}")
     print(f"load average before {before:.1f}, after {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores")
 
 
