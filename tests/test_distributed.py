@@ -1,5 +1,8 @@
 """Training shared by two processes: gradients, decisions and files as in a single one."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import torch as th
@@ -195,3 +198,29 @@ def test_step_loop_is_refused(tmp_path):
 
     for error in run_ranks(2, tmp_path, cart_pole):
         assert isinstance(error, ValueError) and "can only share whole episodes" in str(error)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_an_error_and_what_follows_only_the_error_is_reported(tmp_path, first):
+    def one_fails(rank):
+        with distributed.process_group():
+            assert distributed.world_size() == 2
+            if rank == first:
+                raise OSError("no space left")
+            distributed.barrier()
+
+    results = run_ranks(2, tmp_path, one_fails, connected=False)
+    assert isinstance(results[first], OSError)
+    assert isinstance(results[1 - first], SystemExit) and results[1 - first].code == 2
+
+
+def test_a_killed_process_ends_the_others(tmp_path):
+    def one_is_killed(rank):
+        with distributed.process_group():
+            if rank == 1:
+                os.kill(os.getpid(), signal.SIGKILL)
+            distributed.barrier()
+
+    error, nothing = run_ranks(2, tmp_path, one_is_killed, connected=False)
+    assert nothing is None
+    assert isinstance(error, ValueError) and "another process of this run has ended" in str(error)
