@@ -2,6 +2,7 @@
 
 import os
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
 
-SMALL = dict(embed_dim=16, n_heads=2, n_layers=2, ff_dim=16)
+SMALL: dict[str, Any] = dict(embed_dim=16, n_heads=2, n_layers=2, ff_dim=16)
 # Seven instances: shares of 3 and 4.
 N_ENVS = 7
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "shared": dict(baseline="shared", n_samples=3, normalize_advantage=True),
     "instance": dict(baseline="shared", n_samples=3, normalize_advantage="instance"),
     "exponential": dict(baseline="exponential", ent_coef=0.1),

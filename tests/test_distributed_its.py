@@ -3,6 +3,7 @@
 import io
 import json
 from contextlib import redirect_stderr, redirect_stdout
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +21,17 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.imitation import imitate
 
-SMALL = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
-ROUTER = dict(policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20))
+SMALL: dict[str, Any] = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
+ROUTER: dict[str, Any] = dict(
+    policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
+)
+    policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
+)
 
 
 def make(seed=2):
     env = BatchedVecEnv([lambda: TaskAllocationEnv(n_tasks=7, n_uavs=2)] * 5)
-    settings = dict(n_samples=2, baseline="shared", instances_per_epoch=10, learning_rate=1e-3)
+    settings: dict[str, Any] = dict(n_samples=2, baseline="shared", instances_per_epoch=10, learning_rate=1e-3)
     return REINFORCE("AllocatorPolicy", env, policy_kwargs=SMALL, seed=seed, device="cpu", **settings)
 
 
