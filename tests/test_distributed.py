@@ -1,5 +1,9 @@
 """Training shared by two processes: gradients, decisions and files as in a single one."""
 
+import os
+import signal
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -13,10 +17,10 @@ from sb3_uav.envs.routing import RoutePlanningEnv
 from sb3_uav.envs.vec_env import BatchedVecEnv
 from sb3_uav.reinforce import REINFORCE
 
-SMALL = dict(embed_dim=16, n_heads=2, n_layers=2, ff_dim=16)
+SMALL: dict[str, Any] = dict(embed_dim=16, n_heads=2, n_layers=2, ff_dim=16)
 # Seven instances: shares of 3 and 4.
 N_ENVS = 7
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "shared": dict(baseline="shared", n_samples=3, normalize_advantage=True),
     "instance": dict(baseline="shared", n_samples=3, normalize_advantage="instance"),
     "exponential": dict(baseline="exponential", ent_coef=0.1),
@@ -195,3 +199,29 @@ def test_step_loop_is_refused(tmp_path):
 
     for error in run_ranks(2, tmp_path, cart_pole):
         assert isinstance(error, ValueError) and "can only share whole episodes" in str(error)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_an_error_and_what_follows_only_the_error_is_reported(tmp_path, first):
+    def one_fails(rank):
+        with distributed.process_group():
+            assert distributed.world_size() == 2
+            if rank == first:
+                raise OSError("no space left")
+            distributed.barrier()
+
+    results = run_ranks(2, tmp_path, one_fails, connected=False)
+    assert isinstance(results[first], OSError)
+    assert isinstance(results[1 - first], SystemExit) and results[1 - first].code == 2
+
+
+def test_a_killed_process_ends_the_others(tmp_path):
+    def one_is_killed(rank):
+        with distributed.process_group():
+            if rank == 1:
+                os.kill(os.getpid(), signal.SIGKILL)
+            distributed.barrier()
+
+    error, nothing = run_ranks(2, tmp_path, one_is_killed, connected=False)
+    assert nothing is None
+    assert isinstance(error, ValueError) and "another process of this run has ended" in str(error)

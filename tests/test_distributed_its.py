@@ -1,10 +1,9 @@
 """ITS and imitation shared by two processes; their files, and the command line."""
 
+import io
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
+from contextlib import redirect_stderr, redirect_stdout
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +21,17 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback
 from sb3_uav.training.imitation import imitate
 
-SMALL = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
-ROUTER = dict(policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20))
+SMALL: dict[str, Any] = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
+ROUTER: dict[str, Any] = dict(
+    policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
+)
+    policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
+)
 
 
 def make(seed=2):
     env = BatchedVecEnv([lambda: TaskAllocationEnv(n_tasks=7, n_uavs=2)] * 5)
-    settings = dict(n_samples=2, baseline="shared", instances_per_epoch=10, learning_rate=1e-3)
+    settings: dict[str, Any] = dict(n_samples=2, baseline="shared", instances_per_epoch=10, learning_rate=1e-3)
     return REINFORCE("AllocatorPolicy", env, policy_kwargs=SMALL, seed=seed, device="cpu", **settings)
 
 
@@ -169,36 +172,32 @@ TaskAllocation-U2-N7-v0:
 """
 
 
-def torchrun(tmp_path, *arguments):
-    """:return: The finished command, two processes that train in ``tmp_path``"""
+def train_as_torchrun(tmp_path, monkeypatch, *arguments):
+    """:return: Exit codes, standard outputs and standard errors of two processes that train in ``tmp_path``"""
+    train = pytest.importorskip("sb3_uav.zoo.train")
+    pytest.importorskip("rl_zoo3")
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yml").write_text(YAML)
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        "-m",
-        "sb3_uav.zoo.train",
-    ]
     own = ["--env", "TaskAllocation-U2-N7-v0", "--conf-file", "small.yml", "-f", "logs", "--device", "cpu"]
-    # The package may not be installed, but importable from here.
-    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [*command, *own, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-    )
+
+    def run(_):
+        with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+            try:
+                code = train.main([*own, *arguments])
+            except SystemExit as end:
+                code = end.code
+        return code, out.getvalue(), err.getvalue()
+
+    return zip(*run_ranks(2, tmp_path / "ranks", run, connected=False), strict=True)
 
 
 @pytest.mark.slow
-def test_torchrun(tmp_path):
-    pytest.importorskip("rl_zoo3")
-    done = torchrun(tmp_path, "-tb", "tb")
-    assert done.returncode == 0, done.stderr
+def test_command_line(tmp_path, monkeypatch):
+    codes, outputs, errors = train_as_torchrun(tmp_path, monkeypatch, "-tb", "tb")
+    assert codes == (0, 0), errors
     # One run folder, one report.
     assert [path.name for path in (tmp_path / "logs" / "reinforce").iterdir()] == ["TaskAllocation-U2-N7-v0_1"]
-    assert done.stdout.count("Saving to logs/reinforce/TaskAllocation-U2-N7-v0_1") == 1
+    assert "Saving to logs/reinforce/TaskAllocation-U2-N7-v0_1" in outputs[0] and outputs[1] == ""
     run = tmp_path / "logs" / "reinforce" / "TaskAllocation-U2-N7-v0_1"
     assert (run / "best_model.zip").is_file() and (run / "router.zip").is_file()
     # 10 instances with 2 samples, each once.
@@ -206,11 +205,9 @@ def test_torchrun(tmp_path):
     assert len(list((tmp_path / "tb").rglob("events.*"))) == 2
 
 
-@pytest.mark.slow
-def test_torchrun_reports_an_error_once(tmp_path):
-    pytest.importorskip("rl_zoo3")
-    failed = torchrun(tmp_path, "--algo", "ppo")
-    assert failed.returncode != 0
-    assert failed.stderr.count("sb3-uav train: error: torchrun: several processes can only share --algo reinforce") == 1
-    assert "Traceback (most recent call last):\n  File" not in failed.stderr.split("torch/distributed")[0]
+def test_command_line_reports_an_error_once(tmp_path, monkeypatch):
+    codes, _, errors = train_as_torchrun(tmp_path, monkeypatch, "--algo", "ppo")
+    assert codes == (2, 2)
+    assert "".join(errors).count("error: torchrun: several processes can only share --algo reinforce") == 1
+    assert "" in errors
     assert not (tmp_path / "logs").exists()

@@ -243,26 +243,28 @@ def share_tensors(tensors: Iterable[th.Tensor]) -> None:
             dist.broadcast(tensor.data, src=0)
 
 
-def sum_gradients(parameters: Sequence[th.nn.Parameter]) -> None:
+def sum_gradients(parameters: Sequence[th.nn.Parameter], *numbers: float) -> list[float]:
     """
     Replace gradients by their sums over all ranks, each of which has the gradient of its part of the loss.
 
-    :param parameters: The same on all ranks
+    :param parameters: The same on all ranks, at least one of them learning
+    :param numbers: Numbers of this rank, sent along
+    :return: Their sums, in float32
     """
     if world_size() == 1:
-        return
+        return list(numbers)
     learning = [parameter for parameter in parameters if parameter.requires_grad]
-    if not learning:
-        return
-    # One message for all; the last entries tell which parameters had a gradient on any rank.
+    # One message for all; some parameters may have a gradient on other ranks only.
     gradients = [th.zeros_like(p) if p.grad is None else p.grad for p in learning]
-    has_gradient = gradients[0].new_tensor([float(p.grad is not None) for p in learning])
-    message = th.cat([*(gradient.flatten() for gradient in gradients), has_gradient])
+    others = gradients[0].new_tensor([*(float(p.grad is not None) for p in learning), *numbers])
+    message = th.cat([*(gradient.flatten() for gradient in gradients), others])
     dist.all_reduce(message)
-    *summed, counts = message.split([*(p.numel() for p in learning), len(learning)])
-    for parameter, gradient, count in zip(learning, summed, counts.tolist(), strict=True):
+    *summed, others = message.split([*(p.numel() for p in learning), len(others)])
+    counts, sums = others.tolist()[: len(learning)], others.tolist()[len(learning) :]
+    for parameter, gradient, count in zip(learning, summed, counts, strict=True):
         if count > 0:
             parameter.grad = gradient.view_as(parameter)
+    return sums
 
 
 def sum_with_gradient(tensor: th.Tensor) -> th.Tensor:
@@ -270,8 +272,21 @@ def sum_with_gradient(tensor: th.Tensor) -> th.Tensor:
     :param tensor: Of the same shape on all ranks
     :return: The sum over all ranks, through which gradients flow back to each of them
     """
-    if world_size() == 1:
-        return tensor
-    from torch.distributed.nn.functional import all_reduce
+    return tensor if world_size() == 1 else _Sum.apply(tensor)
 
-    return all_reduce(tensor)
+
+class _Sum(th.autograd.Function):
+    """The sum over all ranks. Torch's own functions for this are deprecated or private."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: th.Tensor) -> th.Tensor:
+        summed = tensor.detach().clone(memory_format=th.contiguous_format)
+        dist.all_reduce(summed)
+        return summed
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
+        # Each rank's part is in the sum of every rank.
+        summed = gradient.clone(memory_format=th.contiguous_format)
+        dist.all_reduce(summed)
+        return summed

@@ -30,8 +30,9 @@ def accumulate_gradients(model: Any, batch: EpisodeBatch | None) -> th.Tensor:
         parts = step_loss(model)
         parts.loss.backward()
     else:
-        parts = _summed_over_ranks(_accumulate_episodes(model, batch))
-        distributed.sum_gradients(list(model.policy.parameters()))
+        parts, baseline = _over_ranks(model, _accumulate_episodes(model, batch), batch.weight * batch.baseline.mean().item())
+        if model.baseline != "critic":
+            model.logger.record("train/baseline", baseline)
     model.logger.record("train/policy_gradient_loss", parts.policy.item())
     model.logger.record("train/entropy_loss", -parts.entropy.item())
     if parts.value is not None:
@@ -51,8 +52,6 @@ def _accumulate_episodes(model: Any, batch: EpisodeBatch) -> LossParts:
         to_go = batch.rewards_to_go(model.problem)[real]
         variance = explained_variance(values[real].cpu().numpy(), to_go.cpu().numpy())
         model.logger.record("train/explained_variance", float(variance))
-    else:
-        model.logger.record("train/baseline", distributed.total(batch.weight * batch.baseline.mean().item()))
     advantages = episode_advantages(model, batch, values)
     require_finite(model, baseline=batch.baseline, advantage=advantages)
     total: LossParts | None = None
@@ -65,13 +64,21 @@ def _accumulate_episodes(model: Any, batch: EpisodeBatch) -> LossParts:
     return total
 
 
-def _summed_over_ranks(parts: LossParts) -> LossParts:
-    """:return: The parts of the loss of all processes, so that all of them decide alike whether it is finite"""
+def _over_ranks(model: Any, parts: LossParts, baseline: float) -> tuple[LossParts, float]:
+    """
+    Add the gradients of all processes.
+
+    :param model: A REINFORCE algorithm
+    :param parts: This process's part of the loss
+    :param baseline: Its part of the mean of the baseline values
+    :return: The sums over all processes, by which all of them decide alike whether they are finite
+    """
+    own = [part.item() for part in parts if part is not None]
+    *sums, baseline = distributed.sum_gradients(list(model.policy.parameters()), *own, baseline)
     if distributed.world_size() == 1:
-        return parts
-    loss, policy, entropy, *value = distributed.totals(*(part.item() for part in parts if part is not None))
-    made = [th.tensor(number, dtype=th.float32, device="cpu") for number in (loss, policy, entropy, *value)]
-    return LossParts(made[0], made[1], made[2], made[3] if value else None)
+        return parts, baseline
+    loss, policy, entropy, *value = [th.tensor(number, dtype=th.float32, device="cpu") for number in sums]
+    return LossParts(loss, policy, entropy, value[0] if value else None), baseline
 
 
 @th.no_grad()

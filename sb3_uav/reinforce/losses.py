@@ -60,6 +60,8 @@ def episode_advantages(model: Any, batch: EpisodeBatch, values: th.Tensor | None
         n_steps)``, 0 after the end of an episode
     """
     if values is None:
+        if not model.normalize_advantage:
+            return (batch.returns - batch.baseline).float()[..., None]
         # Of the whole batch, whichever processes share it, so that all divide by the same numbers.
         everywhere = distributed.gather((batch.returns - batch.baseline).float(), batch.n_instances)
         return _normalized(model, everywhere)[batch.rows][..., None]

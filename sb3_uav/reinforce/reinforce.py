@@ -298,9 +298,9 @@ class REINFORCE(MaskedStepLoop, AnySizeAlgorithm):
         actions = self.policy.decode_episodes(instances, self.n_samples, False, generator, cache)
         with th.no_grad():
             returns = problem.returns(instances, actions)
-            require_finite_returns(self, distributed.gather(returns, n_instances))
+            samples = episodes_of_all(episodes_by_sample(problem, instances, actions, returns), n_instances)
+            require_finite_returns(self, th.as_tensor(np.stack([played.returns for played in samples]), device="cpu"))
             baseline = self._baseline.of_episodes(problem, instances, returns)
-        samples = episodes_of_all(episodes_by_sample(problem, instances, actions, returns), n_instances)
         if not distributed.all_agree(self._report_episodes(env, callback, samples)):
             return False
         # In micro-batches each is encoded again, with gradients.
