@@ -7,7 +7,6 @@ import io
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
@@ -106,7 +105,7 @@ class EvaluationFolder:
         if schedule is not None:
             schedule_at = _append(self._schedules_file, json.dumps(schedule) + "\n")
         line = io.StringIO()
-        csv.writer(line, lineterminator="\n").writerow(asdict(row).values())
+        csv.writer(line, lineterminator="\n").writerow(row.cells)
         result_at = _append(self._results_file, line.getvalue())
         self.index.of(row.key).set(row, Place(result_at, schedule_at))
 
