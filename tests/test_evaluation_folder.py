@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -200,6 +201,30 @@ def test_cells_that_cannot_be(column: str, value: str, instances: Instances, tmp
     (tmp_path / "results.csv").write_text("\n".join([header, ",".join(cells.values()), *others]) + "\n")
     with pytest.raises(ValueError, match=rf"results.csv, line 2: (is damaged .*{value}|holds results of 'unknown')"):
         evaluate([Stub()], instances, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("name", ["results.csv", "schedules.jsonl", "evaluation.json"])
+@pytest.mark.parametrize("before", ["nothing", "another evaluation"])
+def test_resuming_after_a_kill_in_the_first_instants(
+    before: str, name: str, instances: Instances, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before one of the three files is in its place, there is nothing to resume, and nothing in the way."""
+    if before == "another evaluation":
+        evaluate([Nearest()], instances[:2], tmp_path)
+    replace_file = os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        if Path(target).name == name:
+            raise KeyboardInterrupt
+        replace_file(source, target)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, "replace", killed)
+        evaluate([Stub()], instances, tmp_path)
+    # Where another evaluation was to be replaced and is still there, it was not replaced.
+    is_there = before == "another evaluation" and name != "evaluation.json"
+    evaluate([Stub()], instances, tmp_path, resume=not is_there)
+    assert [row["solver"] for row in read_rows(tmp_path)] == ["stub"] * 5
 
 
 def test_changed_versions_are_said(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import astuple, fields
 from typing import Any
 
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule, ScheduleReport, check_schedule, schedule_to_json
 from sb3_uav.evaluation.parallel import Failure
-from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, SCHEDULES_FILE, ResultRow, one_line
+from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, RESULT_COLUMNS, SCHEDULES_FILE, ResultRow, one_line
 from sb3_uav.solvers.base import SolverResult
 
 # Other versions of Python round lengths differently, in the last digit.
@@ -88,10 +87,10 @@ def check_again(batch: Instances, row: int, kept: ResultRow, text: str | None) -
         record = json.loads(text)
         result = SolverResult(_schedule(record), kept.seconds, kept.batch_size, kept.bound)
     found, line = checked_result((batch, row, kept.instance, kept.source), run, result)
-    for field, was, is_now in zip(fields(ResultRow), astuple(kept), astuple(found), strict=True):
-        if field.name != "message" and not _is_same(was, is_now):
+    for column, was, is_now in zip(RESULT_COLUMNS, kept.cells, found.cells, strict=True):
+        if column != "message" and not _is_same(was, is_now):
             why = "for a failure" if text is None else f"by the routes in {SCHEDULES_FILE}"
-            raise ValueError(f"{field.name} is {was!r}, but {why} it is {is_now!r}")
+            raise ValueError(f"{column} is {was!r}, but {why} it is {is_now!r}")
     for name in {**(line or {}), **record}:
         was, is_now = record.get(name), (line or {}).get(name)
         if not _is_same(was, is_now):
@@ -100,6 +99,9 @@ def check_again(batch: Instances, row: int, kept: ResultRow, text: str | None) -
 
 def _is_same(was: Any, is_now: Any) -> bool:
     """Whether two values are the same but for rounding."""
+    # Most are; they are of one type, too.
+    if type(was) is type(is_now) and was == is_now and type(was) is not list:
+        return True
     if isinstance(was, list) and isinstance(is_now, list):
         return len(was) == len(is_now) and all(map(_is_same, was, is_now))
     if type(was) is bool or type(is_now) is bool or not (isinstance(was, int | float) and isinstance(is_now, int | float)):

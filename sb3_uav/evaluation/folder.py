@@ -7,7 +7,6 @@ import io
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,12 +16,13 @@ from sb3_uav.evaluation.instance_sets import InstanceSet
 from sb3_uav.evaluation.provenance import describe_machine, describe_solver
 from sb3_uav.evaluation.result_index import Place, ResultIndex
 from sb3_uav.evaluation.result_lines import ResultLines, copy_in_order, read_index
-from sb3_uav.evaluation.results import RESULTS_FILE, SCHEDULES_FILE, SETTINGS_FILE, ResultRow, one_line
+from sb3_uav.evaluation.results import RESULT_COLUMNS, RESULTS_FILE, SCHEDULES_FILE, SETTINGS_FILE, ResultRow, one_line
 from sb3_uav.evaluation.shard import Shard
 from sb3_uav.solvers.base import Solver
 
 # Of ``evaluation.json``.
 FORMAT = 1
+_HEADER = (",".join(RESULT_COLUMNS) + "\n").encode()
 
 
 def _abridged(setting: Any) -> str:
@@ -70,7 +70,7 @@ class EvaluationFolder:
             "solvers": {solver.name: describe_solver(solver) for solver in solvers},
             "runs": [{**run, **describe_machine()}],
         }
-        resume = resume and (folder / RESULTS_FILE).exists()
+        resume = resume and _holds_results(folder / RESULTS_FILE)
         if resume:
             settings = self._merged(settings)
         self._sets: list[dict[str, Any]] = settings["instances"]
@@ -106,7 +106,7 @@ class EvaluationFolder:
         if schedule is not None:
             schedule_at = _append(self._schedules_file, json.dumps(schedule) + "\n")
         line = io.StringIO()
-        csv.writer(line, lineterminator="\n").writerow(asdict(row).values())
+        csv.writer(line, lineterminator="\n").writerow(row.cells)
         result_at = _append(self._results_file, line.getvalue())
         self.index.of(row.key).set(row, Place(result_at, schedule_at))
 
@@ -201,6 +201,15 @@ class EvaluationFolder:
                     start = one.first_index + first
                     if any(run.present[start : start + size].any() for run in self.index.runs.values()):
                         lines.check_again(self.index, one.part_at(first), start)
+
+
+def _holds_results(path: Path) -> bool:
+    """Whether there is a file that is not only a header of ours: all there is where a run was killed in its first instants."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_HEADER) + 1) != _HEADER
+    except FileNotFoundError:
+        return False
 
 
 def _append(file: IO[bytes], text: str) -> int:

@@ -7,7 +7,6 @@ import io
 from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
 from types import TracebackType
@@ -120,7 +119,7 @@ class ResultLines:
         # Of an earlier version.
         text = io.StringIO()
         row = parse_result(self._columns, line.decode().rstrip("\n"))
-        csv.writer(text, lineterminator="\n").writerow(asdict(row).values())
+        csv.writer(text, lineterminator="\n").writerow(row.cells)
         return text.getvalue().encode()
 
     def schedule(self, place: Place) -> bytes | None:

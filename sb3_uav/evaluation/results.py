@@ -77,6 +77,11 @@ class ResultRow:
     def key(self) -> ResultKey:
         return ResultKey(self.solver, self.instance, self.time_limit, self.seed)
 
+    @property
+    def cells(self) -> list[Any]:
+        """The values in the order of the columns; without the deep copies of ``dataclasses.astuple``."""
+        return [getattr(self, name) for name in RESULT_COLUMNS]
+
 
 RESULT_COLUMNS = tuple(field.name for field in fields(ResultRow))
 # Of earlier versions, whose results are read and resumed as well.

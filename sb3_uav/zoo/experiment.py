@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
+from sb3_uav.zoo.shared_study import SeedPerTrial, fail_trials_of_dead_workers, note_worker, shared_studies
 from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
 # Errors that values of the wrong kind cause while callbacks, environments and the algorithm are created.
@@ -279,13 +281,28 @@ class UAVExperimentManager(ExperimentManager):
         # By name, so that every trial gets its own instance.
         self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
         try:
-            super().hyperparameters_optimization()
+            with shared_studies():
+                super().hyperparameters_optimization()
         except ValueError as error:
             if "No trials are completed" not in str(error):
                 raise
             raise ValueError("-optimize: all trials were pruned, there is no best one; allow more trials.") from error
 
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        if self.storage is None:
+            return super()._create_sampler(sampler_method)
+
+        def make(seed: int) -> optuna.samplers.BaseSampler:
+            # A copy, because several trials may begin at once.
+            stand_in = copy(self)
+            stand_in.seed = seed
+            return super(UAVExperimentManager, stand_in)._create_sampler(sampler_method)
+
+        return SeedPerTrial(make, self.seed)
+
     def objective(self, trial: optuna.Trial) -> float:
+        note_worker(trial)
+        fail_trials_of_dead_workers(trial.study)
         try:
             mean_reward = super().objective(trial)
         except (RuntimeError, FloatingPointError) as error:

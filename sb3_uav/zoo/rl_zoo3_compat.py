@@ -21,7 +21,7 @@ from unittest import mock
 from sb3_uav.common.optional import install_command
 
 try:
-    import optuna  # noqa: F401  (rl_zoo3 imports it; a missing one is reported here too)
+    import optuna  # rl_zoo3 imports it; a missing one is reported here too.
     import rl_zoo3
     import rl_zoo3.train
     import rl_zoo3.utils
@@ -170,6 +170,27 @@ def replay_environment(make: Callable[..., VecEnv]) -> Iterator[None]:
     import rl_zoo3.enjoy
 
     with _replaced(rl_zoo3.enjoy, "create_test_env", make):
+        yield
+
+
+@contextmanager
+def created_studies(opened: Callable[[Any], Any], started: Callable[[optuna.Study], None]) -> Iterator[None]:
+    """
+    Change how ``-optimize`` opens its study; it passes the URL of a database on as it was given.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L922
+
+    :param opened: Takes the storage, a URL or an object, and returns what to use in its place
+    :param started: Called with the study
+    """
+    create_study = optuna.create_study
+
+    def create(*, storage: Any = None, **kwargs: Any) -> optuna.Study:
+        study = create_study(storage=opened(storage), **kwargs)
+        started(study)
+        return study
+
+    with _replaced(optuna, "create_study", create):
         yield
 
 
