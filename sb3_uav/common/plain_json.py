@@ -12,17 +12,18 @@ _STRING = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
 _LONG_NUMBER = re.compile(rb"[-+.0-9eE]{100}")
 
 
-def read_plain_json(text: bytes) -> Any:
+def read_plain_json(text: bytes, most: int = MAX_VALUES) -> Any:
     """
     :param text: JSON
+    :param most: The largest number of values
     :return: What it holds
     :raises ValueError: If it is not JSON, or holds more or deeper values than anything of ours
     """
     # The pickles that SB3 writes are strings, which may be long.
     marks = _STRING.sub(b"", text)
     n_values = sum(marks.count(mark) for mark in (b",", b":", b"[", b"{"))
-    if n_values > MAX_VALUES:
-        raise ValueError(f"it holds {n_values} values, more than the {MAX_VALUES} that are read")
+    if n_values > most:
+        raise ValueError(f"it holds {n_values} values, more than the {most} that are read")
     depth = 0
     for mark in re.findall(rb"[\[{\]}]", marks):
         depth += 1 if mark in b"[{" else -1

@@ -6,8 +6,12 @@ No other module does either. Each function links the upstream code that it relie
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import numpy as np
-from stable_baselines3.common import utils
+from stable_baselines3.common import base_class, utils
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -89,3 +93,20 @@ def replace_logger(model: BaseAlgorithm, logger: Logger) -> None:
     :param logger: Its new logger
     """
     model._logger = logger
+
+
+@contextmanager
+def replaced_zip_reader(make: Callable[[Any], Any]) -> Iterator[None]:
+    """
+    Replace the function with which ``load`` and ``set_parameters`` read zips, which unpickles them.
+
+    https://github.com/DLR-RM/stable-baselines3/blob/v2.9.2/stable_baselines3/common/base_class.py#L677
+
+    :param make: Takes the function of this name that is in place now, and returns another one with the same arguments
+    """
+    before = base_class.load_from_zip_file
+    base_class.load_from_zip_file = make(before)
+    try:
+        yield
+    finally:
+        base_class.load_from_zip_file = before

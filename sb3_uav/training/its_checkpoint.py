@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.epoch_log import EpochRecord
 from sb3_uav.common.files import file_hash, write_atomically
-from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.plain_json import read_plain_json
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.generators import InstanceGenerator
@@ -23,6 +23,8 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.training.kept_checkpoints import STATE_FILE, earlier_states, keep_previous, remove_old
 
 CHECKPOINT_FOLDER = "its_checkpoint"
+# A record of an epoch takes 250 bytes and 16 values.
+MAX_STATE_BYTES, MAX_STATE_VALUES = 32 * 2**20, 2_000_000
 WARM_START_FOLDER = "warm_start"
 # An attribute of the allocator, so that every zip of it names its last checkpoint: stock rl_zoo3 does not tell callbacks
 # which zip a run continues.
@@ -149,7 +151,10 @@ def read_state(folder: Path, file: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give the {CHECKPOINT_FOLDER} folder of an earlier run.")
     try:
-        state = parse_json(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if size > MAX_STATE_BYTES:
+            raise ValueError(f"it has {size} bytes, more than the {MAX_STATE_BYTES} that are read")
+        state = read_plain_json(path.read_bytes(), MAX_STATE_VALUES)
     except ValueError as error:
         raise _damaged(path, str(error)) from error
     if not isinstance(state, dict):
@@ -162,6 +167,8 @@ def read_state(folder: Path, file: str | None = None) -> dict[str, Any]:
     for level in ("allocator", "router"):
         if not (isinstance(state[level], str) and re.fullmatch(r"[\w.-]+\.zip", state[level])):
             raise _damaged(path, f"{level} is {state[level]!r:.40}, not the name of a zip")
+        if (path.parent / state[level]).resolve().parent != path.parent.resolve():
+            raise _damaged(path, f"{level} is {state[level]!r:.40}, a link that leads out of the folder")
     if not isinstance(state.get("warm_started", True), bool):
         raise _damaged(path, f"warm_started is {state['warm_started']!r:.40}")
     share = state.get("share", 1.0)

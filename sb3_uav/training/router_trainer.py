@@ -29,6 +29,7 @@ from sb3_uav.reinforce.algorithms import resolve_algorithm
 from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.transfer import fine_tuning_settings, load
 from sb3_uav.training.episode_buffer import use_episode_buffer
+from sb3_uav.training.safe_load import safe_zips
 from sb3_uav.training.subsets import WholeInstances
 
 # Settings that follow from the environment, or that the router's zip decides when a run is resumed.
@@ -199,7 +200,7 @@ class RouterTrainer:
         # From the new router, as its constructor may have changed them.
         settings = {key: getattr(self.algorithm, key) for key in given if hasattr(self.algorithm, key)}
         try:
-            with undisturbed_random_state():
+            with undisturbed_random_state(), safe_zips():
                 loaded = type(self.algorithm).load(path, env=self.env, device=self.algorithm.device, **settings)
         except (ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"{path}: not an intact router ({error}); use another checkpoint.") from error

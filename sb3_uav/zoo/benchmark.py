@@ -35,7 +35,7 @@ def benchmark(arguments: Sequence[str]) -> None:
     from sb3_uav.zoo.experiment import register_algorithms
     from sb3_uav.zoo.replay import without_flag
     from sb3_uav.zoo.rl_zoo3_compat import command_line, help_text, run_script
-    from sb3_uav.zoo.trust import TRUST_FLAG
+    from sb3_uav.zoo.trust import TRUST_FLAG, require_plain_run
 
     register_algorithms()
     arguments, trust = without_flag(arguments, "--trust")
@@ -51,8 +51,13 @@ def benchmark(arguments: Sequence[str]) -> None:
             run_script("rl_zoo3.benchmark")
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--benchmark-dir", type=Path, default=Path("logs/benchmark"))
+    parser.add_argument("--log-dir", type=Path, default=Path("logs"))
+    given = parser.parse_known_args(arguments)[0]
+    for path in given.log_dir.glob("*/*/*/args.yml"):
+        # rl_zoo3 reads them with a loader that creates any object they name.
+        require_plain_run(path.parent.parent, path.parent.name, trust)
     # rl_zoo3 writes there even if no replay has made it.
-    parser.parse_known_args(arguments)[0].benchmark_dir.mkdir(parents=True, exist_ok=True)
+    given.benchmark_dir.mkdir(parents=True, exist_ok=True)
     with command_line(_PROG, ["--log-dir", "logs", "--no-hub", *arguments]):
         run_script("rl_zoo3.benchmark", run_command=replay)
     if codes and any(codes):

@@ -14,6 +14,9 @@ _HELP = """\
 Replay a trained agent with rl_zoo3. An allocator's rewards come from the router of its run: that of the best pair with
 --load-best, that of the same moment with --load-checkpoint and --load-last-checkpoint.
 
+Agents with the policies of sb3_uav are read without unpickling them. Others, and runs with pickles or code in their settings,
+need --trust: rl_zoo3 unpickles them, which runs any code that their author put there.
+
 The defaults below are rl_zoo3's, but for these: --algo is reinforce, --folder is logs.
 """
 
@@ -31,7 +34,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     from sb3_uav.zoo.experiment import make_batched_vec_env, register_algorithms
     from sb3_uav.zoo.replay import agent_parser, environment_of, find_agent, without_flag
     from sb3_uav.zoo.rl_zoo3_compat import command_line, default_vec_env, help_text, replay_environment
-    from sb3_uav.zoo.trust import TRUST_FLAG
+    from sb3_uav.zoo.trust import TRUST_FLAG, reading
 
     register_algorithms()
     import rl_zoo3.enjoy
@@ -41,9 +44,15 @@ def enjoy(arguments: Sequence[str]) -> None:
     if chosen.help:
         with command_line(_PROG, ["--help"]), help_text(rl_zoo3.enjoy, _HELP, TRUST_FLAG):
             rl_zoo3.enjoy.enjoy()
-    make_env = environment_of(find_agent(chosen, trust))
+    agent = find_agent(chosen, trust)
+    make_env = environment_of(agent)
     flags = ["--algo", chosen.algo, "-f", chosen.folder, *arguments]
-    with default_vec_env(make_batched_vec_env), replay_environment(make_env), command_line(_PROG, flags):
+    with (
+        reading(trust, agent.run_folder),
+        default_vec_env(make_batched_vec_env),
+        replay_environment(make_env),
+        command_line(_PROG, flags),
+    ):
         rl_zoo3.enjoy.enjoy()
 
 

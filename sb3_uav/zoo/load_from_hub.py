@@ -24,7 +24,7 @@ def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_PROG,
         description="Download an agent, for an allocator together with its router, into a log folder, where `sb3-uav enjoy` "
-        "and `record-video` find it. Nothing is unpickled; those commands do, and want --trust for it.",
+        "and `record-video` find it. Nothing is unpickled, by those commands neither unless --trust is given.",
     )
     parser.add_argument("--env", required=True, help="environment ID")
     parser.add_argument("--algo", default="reinforce", help="default: %(default)s")
@@ -77,7 +77,7 @@ def load_from_hub(arguments: Sequence[str]) -> None:
         new.rename(run)
     finally:
         shutil.rmtree(new, ignore_errors=True)
-    print(f"Loaded {source} into {run}. `sb3-uav evaluate` reads its zips without unpickling; enjoy needs --trust.")
+    print(f"Loaded {source} into {run}. `sb3-uav enjoy` and `sb3-uav evaluate` find it there.")
 
 
 def _write_run(run: Path, algo: str, env_name: str, source: str, names: set[str], fetch: Callable[[str], Path]) -> None:

@@ -23,6 +23,7 @@ from sb3_uav.common.errors import main_function
 from sb3_uav.common.optional import require
 from sb3_uav.common.random_streams import TEST_SEED
 from sb3_uav.zoo.dependencies import require_zoo
+from sb3_uav.zoo.trust import TRUST_FLAG, reading
 
 if TYPE_CHECKING:
     from sb3_uav.zoo.model_card import Results
@@ -50,7 +51,7 @@ def _make_parser(parent: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--no-render", action="store_true", help="record no video")
     parser.add_argument("-n", "--n-timesteps", type=int, help="steps of the video (default: one episode)")
     parser.add_argument("--device", default="auto", help="default: %(default)s")
-    parser.add_argument("--trust", action="store_true", help="push an agent that load-from-hub downloaded, which unpickles it")
+    parser.add_argument("--trust", action="store_true", help=TRUST_FLAG[1])
     return parser
 
 
@@ -78,7 +79,7 @@ def push_to_hub(arguments: Sequence[str]) -> None:
         raise ValueError(f"--local-dir {args.local_dir}: is not empty; choose another folder.")
     repo_id = repository_id(args.organization, args.repo_name, args.algo, args.env)
     agent = find_agent(args, args.trust)
-    with tempfile.TemporaryDirectory() as temporary:
+    with reading(args.trust, agent.run_folder), tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "repository"
         _write_repository(folder, agent, args)
         if args.local_dir is not None:

@@ -15,6 +15,8 @@ _HELP = """\
 Record a trained agent with rl_zoo3. An allocator's rewards, and the tours in the last picture of an episode, come from the
 router of its run, as in `sb3-uav enjoy`.
 
+Agents are read as in `sb3-uav enjoy`, without unpickling them unless --trust is given.
+
 The defaults below are rl_zoo3's, but for these: --algo is reinforce; --folder is logs; --n-timesteps is one episode of the
 environments of sb3_uav; --output-folder is videos in the folder of the run.
 """
@@ -33,7 +35,7 @@ def record_video(arguments: Sequence[str]) -> None:
     from sb3_uav.zoo.experiment import register_algorithms
     from sb3_uav.zoo.replay import agent_parser, environment_of, episode_length, find_agent, without_flag, without_packages
     from sb3_uav.zoo.rl_zoo3_compat import command_line, help_text, run_script
-    from sb3_uav.zoo.trust import TRUST_FLAG
+    from sb3_uav.zoo.trust import TRUST_FLAG, reading
 
     register_algorithms()
     chosen, _ = agent_parser().parse_known_args(arguments)
@@ -47,7 +49,7 @@ def record_video(arguments: Sequence[str]) -> None:
     agent = find_agent(chosen, trust)
     length = episode_length(agent, chosen.env)
     flags = ["--algo", chosen.algo, "-f", chosen.folder, *([] if length is None else ["-n", str(length)]), *arguments]
-    with command_line(_PROG, flags):
+    with reading(trust, agent.run_folder), command_line(_PROG, flags):
         run_script("rl_zoo3.record_video", environment_of(agent))
 
 

@@ -24,7 +24,7 @@ from sb3_uav.zoo.checkpoints import find_router
 from sb3_uav.zoo.experiment import make_batched_vec_env
 from sb3_uav.zoo.fine_tuning import callback_arguments
 from sb3_uav.zoo.saved import saved_callbacks, saved_env_kwargs
-from sb3_uav.zoo.trust import require_trust
+from sb3_uav.zoo.trust import require_plain_run
 
 # That of ``ITSCallback`` where an entry names none.
 _ROUTER_ALGORITHM = "reinforce"
@@ -68,7 +68,7 @@ def agent_parser(with_help: bool = True) -> argparse.ArgumentParser:
 def find_agent(chosen: argparse.Namespace, trust: bool) -> Agent:
     """
     :param chosen: Arguments of :func:`agent_parser`
-    :param trust: Whether to load an agent from the Hugging Face Hub, which unpickles it
+    :param trust: Whether the run may hold more than plain data, which is then unpickled
     :return: The agent
     :raises ValueError: If there is no such environment or agent, or it is not to be trusted
     """
@@ -81,7 +81,7 @@ def find_agent(chosen: argparse.Namespace, trust: bool) -> Agent:
     except AssertionError as error:
         # rl_zoo3 raises it for a missing folder.
         raise ValueError(str(error)) from error
-    require_trust(Path(run_folder), trust)
+    require_plain_run(Path(run_folder), EnvironmentName(chosen.env), trust, chosen.gym_packages)
     return Agent(Path(model), find_router(Path(model)), Path(run_folder), chosen.algo)
 
 
@@ -116,7 +116,7 @@ def _create_test_env(agent: Agent, env_id: str, **kwargs: Any) -> VecEnv:
         try:
             allocator = load_policy(agent.model, "cpu", AllocatorPolicy)
         except NotOurPolicyError:
-            # The user's own code, or a stock policy. Whoever replays an agent unpickles it anyway.
+            # The user's own code, or a stock policy, which cannot be had without unpickling.
             allocator = load_model(agent.algo, agent.model, "cpu").policy
         # Stock policies define no order.
         if isinstance(allocator, AllocatorPolicy):
@@ -134,7 +134,7 @@ def _create_test_env(agent: Agent, env_id: str, **kwargs: Any) -> VecEnv:
 
 def load_model(algo: str, zip_file: Path, device: str = "auto") -> BaseAlgorithm:
     """
-    Unpickle an agent, which runs any code in its zip.
+    Load an agent as SB3 does, which runs any code in its zip unless :func:`sb3_uav.zoo.trust.reading` prevents it.
 
     :param algo: rl_zoo3's name of its algorithm, or a dotted path
     :param zip_file: Its zip

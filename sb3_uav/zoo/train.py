@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from pathlib import Path
 
@@ -79,11 +79,13 @@ def _train(arguments: Sequence[str]) -> None:
         require_zoo("--track" if known.track else "--tensorboard-log", "tensorboard")
     if known.track:
         require("wandb", "--track", "track")
+    from huggingface_sb3 import EnvironmentName
+
     from sb3_uav.zoo.configs import default_config
     from sb3_uav.zoo.experiment import UAVExperimentManager, register_algorithms
     from sb3_uav.zoo.fine_tuning import zip_of_pair
     from sb3_uav.zoo.rl_zoo3_compat import command_line, experiment_manager, help_text, rl_zoo3
-    from sb3_uav.zoo.trust import TRUST_FLAG, require_trust
+    from sb3_uav.zoo.trust import TRUST_FLAG, reading, require_plain_neighbors
 
     register_algorithms()
     if known.help:
@@ -99,7 +101,7 @@ def _train(arguments: Sequence[str]) -> None:
             f"-i {known.trained_agent}: no such file; give the zip of a trained agent, or one of {names()}."
         )
     if known.trained_agent is not None and shipped is None:
-        require_trust(Path(known.trained_agent).parent, known.trust)
+        require_plain_neighbors(Path(known.trained_agent), EnvironmentName(known.env or "CartPole-v1"), known.trust)
     # The last one counts.
     agent = [] if shipped is None else ["-i", str(shipped)]
     UAVExperimentManager.eval_freq_given = known.eval_freq is not None
@@ -107,7 +109,8 @@ def _train(arguments: Sequence[str]) -> None:
     if known.conf_file is None and (config := default_config(known.algo, known.env)) is not None:
         defaults = ["--conf-file", str(config)]
     words = ["--algo", known.algo, *defaults, *arguments, *agent]
-    with experiment_manager(UAVExperimentManager), command_line(_PROG, words), _readable_errors():
+    safely = nullcontext() if known.trained_agent is None else reading(known.trust, Path(known.trained_agent).parent)
+    with safely, experiment_manager(UAVExperimentManager), command_line(_PROG, words), _readable_errors():
         try:
             rl_zoo3.train.train()
         except Interruption as error:
