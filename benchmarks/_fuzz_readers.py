@@ -34,7 +34,7 @@ from sb3_uav.training.instance_sets import SizeTable
 from sb3_uav.training.its_checkpoint import read_state
 
 Change = Callable[..., bytes]
-NETWORK = {"embed_dim": 8, "n_layers": 1, "n_heads": 2, "ff_dim": 8, "bias_dim": 8}
+NETWORK: dict[str, Any] = {"embed_dim": 8, "n_layers": 1, "n_heads": 2, "ff_dim": 8, "bias_dim": 8}
 # Values of a training that runs in the fuzz: no sizes that are legal and slow.
 _SMALL = tuple(value for value in mutations.VALUES if not isinstance(value, int) or value < 100 or value > 2**40)
 _ENV = "TaskAllocation-U2-N5-v0"

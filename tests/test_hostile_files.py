@@ -17,7 +17,7 @@ from sb3_uav.common.errors import run_command
 from sb3_uav.common.imports import import_object
 from sb3_uav.common.json_text import parse_json
 from sb3_uav.common.npz import read_npz
-from sb3_uav.common.tensor_files import load_tensors
+from sb3_uav.common.saved_tensors import load_tensors
 from sb3_uav.envs import UniformGenerator
 from sb3_uav.evaluation import evaluate
 from sb3_uav.plots.learning_curves import plot_learning_curves

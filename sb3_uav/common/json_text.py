@@ -1,4 +1,8 @@
-"""Reading JSON that may be damaged or hostile."""
+"""
+Reading the JSON that our own runs left, of any size, and perhaps damaged since.
+
+That of strangers is read more strictly by :mod:`~sb3_uav.common.plain_json`.
+"""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
     except Exception as error:
         # Given damaged bytes, zipfile and numpy's header parser (tokenize, ast) raise almost any exception, even MemoryError.
         found = str(error) or type(error).__name__
-        raise ValueError(f"{source}: not an intact .npz of plain arrays ({place}{found}); {advice}.") from error
+        raise ValueError(f"{source}: not an intact .npz of plain arrays ({place:.200}{found:.300}); {advice}.") from error
 
 
 def _check_size(file: zipfile.ZipFile) -> None:

@@ -14,7 +14,7 @@ import torch as th
 from sb3_uav.common import distributed
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.json_text import parse_json
-from sb3_uav.common.tensor_files import load_tensors
+from sb3_uav.common.saved_tensors import load_tensors
 from sb3_uav.envs.instances import Instances
 from sb3_uav.policies import RouterPolicy
 

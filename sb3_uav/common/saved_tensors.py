@@ -1,4 +1,8 @@
-"""Reading files of ``torch.save`` that may be damaged or hostile."""
+"""
+Reading the files that our own runs left by ``torch.save``, of any size, and perhaps damaged since.
+
+The zips of strangers, which are small, are read more strictly by :mod:`~sb3_uav.common.tensor_file`.
+"""
 
 from __future__ import annotations
 
