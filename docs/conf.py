@@ -22,9 +22,6 @@ myst_heading_anchors = 6
 # Notebooks are stored with their outputs, which `make notebooks` writes and tests/test_notebooks.py checks.
 nb_execution_mode = "off"
 
-# The toctree "At scale" names pages by patterns.
-suppress_warnings = ["toc.glob"]
-
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
