@@ -118,8 +118,8 @@ def _of(thing: Callable[..., Any], more: dict[str, str] | None = None) -> str:
     about = {**(more or {})}
     for owner in reversed(inspect.getmro(thing) if isinstance(thing, type) else (thing,)):
         about.update(_descriptions(inspect.getdoc(owner) if owner is not object else ""))
-        if isinstance(owner, type):
-            about.update(_descriptions(owner.__init__.__doc__))
+        if "__init__" in vars(owner):
+            about.update(_descriptions(vars(owner)["__init__"].__doc__))
     missing = sorted(name for name in keys_of(thing) if name not in about)
     if missing:
         raise ValueError(f"{thing.__name__}: the docstring describes no {missing}; add `:param ...:`.")

@@ -18,9 +18,11 @@ def run(path: Path) -> nbformat.NotebookNode:
     :raises nbclient.exceptions.CellExecutionError: If a cell fails; the message holds the cell and the error
     """
     notebook = nbformat.read(path, as_version=4)
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(FOLDER.parents[1]), os.environ.get("PYTHONPATH", "")])
+    # Figures are shown in the notebook, whatever the caller's backend is.
+    env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
+    env["PYTHONPATH"] = os.pathsep.join([str(FOLDER.parents[1]), env.get("PYTHONPATH", "")])
     client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}})
-    client.execute()
+    client.execute(env=env)
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
