@@ -25,8 +25,6 @@ SMALL: dict[str, Any] = dict(embed_dim=16, n_heads=2, n_layers=1, ff_dim=16)
 ROUTER: dict[str, Any] = dict(
     policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
 )
-    policy="RouterPolicy", policy_kwargs=SMALL, baseline="rollout", baseline_kwargs=dict(n_test_instances=20)
-)
 
 
 def make(seed=2):

@@ -28,7 +28,7 @@ from zoo_hub import Hub
 from sb3_uav.cli import main as cli
 from sb3_uav.envs import TaskAllocationEnv
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.zoo import enjoy, train
+from sb3_uav.zoo import enjoy
 from sb3_uav.zoo.saved import read_saved
 from sb3_uav.zoo.trust import require_plain_run
 
@@ -339,7 +339,7 @@ def test_own_runs_need_no_trust(logs: Path, monkeypatch: pytest.MonkeyPatch, tmp
     require_plain_run(tmp_path, ENV, trust=False)
     (tmp_path / ENV).mkdir()
     (tmp_path / ENV / "vecnormalize.pkl").write_bytes(b"")
-    with pytest.raises(ValueError, match="is a pickle. .* comes from a/b on the Hugging Face Hub. Add --trust"):
+    with pytest.raises(ValueError, match=r"is a pickle. .* comes from a/b on the Hugging Face Hub. Add --trust"):
         require_plain_run(tmp_path, ENV, trust=False)
     require_plain_run(tmp_path, ENV, trust=True)
     monkeypatch.setenv("TRUST_REMOTE_CODE", "True")
