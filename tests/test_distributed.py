@@ -133,7 +133,9 @@ def collectives(rank):
     if rank == 1:
         half.grad = th.full((1,), 7.0)
     distributed.sum_gradients([weight, unused, half])
-    assert weight.grad.tolist() == [3.0, 3.0] and unused.grad is None and half.grad.tolist() == [7.0]
+    assert weight.grad is not None and weight.grad.tolist() == [3.0, 3.0]
+    assert half.grad is not None and half.grad.tolist() == [7.0]
+    assert unused.grad is None
     return messages
 
 
