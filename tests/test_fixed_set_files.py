@@ -1,15 +1,28 @@
 """Files of an evaluation on a fixed set, and resuming it."""
 
+import csv
 import json
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from fixed_set_runs import N_ENVS, N_TASKS, NETWORK, POLICIES, ROLLOUT, allocation_env, load, make_callback, make_model
+from fixed_set_runs import (
+    N_ENVS,
+    N_TASKS,
+    NETWORK,
+    POLICIES,
+    ROLLOUT,
+    allocation_env,
+    equal,
+    load,
+    make_callback,
+    make_model,
+)
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -19,9 +32,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_uav.envs import BatchedVecEnv, Instances, TaskAllocationEnv
 from sb3_uav.policies.loading import load_policy
 from sb3_uav.reinforce import REINFORCE
-from sb3_uav.training import fixed_set
+from sb3_uav.training import FixedSetEvalCallback, ITSCallback, fixed_set
 from sb3_uav.training.best_pair import BestPair
 from sb3_uav.training.fixed_set_returns import evaluate_fixed_set, fingerprint
+from sb3_uav.training.its_checkpoint import read_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:FixedSetEvalCallback saves nothing")
 
@@ -255,3 +269,54 @@ for flags in ({[*flags, "--eval-freq", "60"]}, {[*flags, *again]}):
     instances = Instances.load(second / "evaluation_instances.npz")
     problem = TaskAllocationEnv(20, 3, max_distance=1.5).problem
     assert evaluate_fixed_set(best, problem, instances, 0).greedy.mean() == history.results.mean(1).max()  # type: ignore[arg-type]
+
+
+class KillBeforeEvaluation(FixedSetEvalCallback):
+    """Ends the run when the given number of evaluations has been made, as a kill between checkpoint and evaluation does."""
+
+    number = 3
+
+    def evaluate(self) -> float:
+        if len(self.history.timesteps) == self.number:
+            raise KeyboardInterrupt
+        return super().evaluate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, dict(eval_updates=2), dict(sizes=[[2, 5, 4], [2, 6, 3]])])
+def test_an_evaluation_that_was_due_is_made_up_for(settings, tmp_path, monkeypatch):
+    """The checkpoint of an epoch comes first. A second kill, before the new folder has an evaluation, loses nothing either."""
+    router = dict(policy="RouterPolicy", n_envs=N_ENVS, policy_kwargs=NETWORK, seed=1)
+    common = dict(n_instances=None if "sizes" in settings else 6, n_samples=3, seed=0, **settings)
+    common = {key: value for key, value in common.items() if value is not None}
+
+    def callbacks(folder: Path, evaluation: type[FixedSetEvalCallback] = FixedSetEvalCallback) -> list[Any]:
+        its = ITSCallback(router, n_epochs=4, n_pretraining_epochs=1, save_path=folder)
+        return [its, evaluation(save_path=folder, **common)]
+
+    def resume(folder: Path) -> Any:
+        checkpoint = folder / "its_checkpoint"
+        file = checkpoint / read_state(checkpoint)["allocator"]
+        return REINFORCE.load(file, env=BatchedVecEnv([allocation_env] * N_ENVS), device="cpu")
+
+    limit = 10**6
+    make_model(REINFORCE).learn(limit, callback=callbacks(tmp_path / "unbroken"))
+    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
+    with pytest.raises(KeyboardInterrupt):
+        make_model(REINFORCE).learn(limit, callback=callbacks(first, KillBeforeEvaluation))
+    monkeypatch.setattr(KillBeforeEvaluation, "number", 4)
+    with pytest.raises(KeyboardInterrupt):
+        resume(first).learn(limit, callback=callbacks(second, KillBeforeEvaluation))
+    resume(second).learn(limit, callback=callbacks(third))
+    found, unbroken = load(third), load(tmp_path / "unbroken")
+    for name in ("timesteps", "results", "sampled", "ep_lengths"):
+        assert np.array_equal(getattr(found, name), getattr(unbroken, name)), name
+    for name in ("best_model.zip", "best_router.zip"):
+        one, other = (load_policy(folder / name) for folder in (third, tmp_path / "unbroken"))
+        assert equal(one.state_dict(), other.state_dict()), name
+    if "sizes" in settings:
+        rows = []
+        for folder in (third, tmp_path / "unbroken"):
+            with (folder / "size_grid.csv").open() as file:
+                rows.append([{**row, "seconds": None} for row in csv.DictReader(file)])
+        assert rows[0] == rows[1]

@@ -6,7 +6,6 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +16,7 @@ from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_streams import FIXED_SET_STREAM, random_stream
 from sb3_uav.common.sb3_compat import n_updates
-from sb3_uav.common.tensorboard import hyperparameters, record_hyperparameters, record_picture, shows_pictures
+from sb3_uav.common.tensorboard import record_picture, shows_pictures
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.problem import Problem
 from sb3_uav.policies import AllocatorPolicy, EpisodicPolicy
@@ -29,6 +28,7 @@ from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory, 
 from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set, evaluated_problem
 from sb3_uav.training.instance_sets import InstanceSets, InstanceSource, SizeTable
 from sb3_uav.training.its import ITSCallback
+from sb3_uav.training.recorded_settings import record_settings
 from sb3_uav.training.run_folder import find_run_folder
 
 _INSTANCES_FILE = "evaluation_instances.npz"
@@ -201,24 +201,16 @@ class FixedSetEvalCallback(BestPairOwner):
             if self.instances_file is not None:
                 self.sets.save(self.folder / self.instances_file)
             self._take_over(self.folder)
+            if len(self.history.timesteps) > 0:
+                # Zips name this folder from now on.
+                self._save_history(self.folder)
         self._learned_steps = self.model.num_timesteps
-        self._evaluated_epoch = self._epoch() or 0
-        self._evaluated_updates = n_updates(self.model)
+        # Before the evaluation that is due now, if the earlier run ended between its checkpoint and that.
+        evaluated = self._state.get("evaluated", {})
+        self._evaluated_epoch = min(self._epoch() or 0, evaluated.get("epoch", np.inf))
+        self._evaluated_updates = min(n_updates(self.model), evaluated.get("updates", np.inf))
         self._note_state(self._now() - self._clock_start)
         self._ready = True
-
-    def _describe(self) -> None:
-        """Record the settings of the training, for TensorBoard."""
-        settings = hyperparameters(self.model)
-        settings["preset"] = (self.model.policy_kwargs or {}).get("preset", "default")
-        settings["network"] = asdict(self._policy.settings)
-        if (its := self._its) is not None:
-            settings["its"] = {"strategy": its.strategy, **asdict(its.schedule)}
-            settings["its"]["warm_start"] = {} if its.warm_start is None else its.warm_start.arguments
-            network: Any = its.router.policy
-            settings["router"] = {**hyperparameters(its.router), "network": asdict(network.settings)}
-        metrics = ["eval/fixed_greedy", "eval/fixed_best", *(["eval/fixed_sampled"] if self.n_samples > 0 else [])]
-        record_hyperparameters(self.logger, settings, metrics)
 
     def _find_policy_and_problem(self) -> tuple[EpisodicPolicy, Problem]:
         policy: Any = self.model.policy
@@ -248,7 +240,10 @@ class FixedSetEvalCallback(BestPairOwner):
 
     @property
     def _state(self) -> dict[str, Any]:
-        """The model's own record: steps and seconds of training, and the folder of the evaluations of each set."""
+        """
+        The model's own record: steps and seconds of training, the folder of the evaluations of each set, and the epoch and
+        update of the last one.
+        """
         return getattr(self.model, EVALUATIONS, {"timesteps": 0, "seconds": [0.0, 0.0], "folders": {}})
 
     def _note_state(self, seconds: np.ndarray) -> None:
@@ -262,6 +257,7 @@ class FixedSetEvalCallback(BestPairOwner):
             "timesteps": self._steps_before + self.model.num_timesteps,
             "seconds": seconds.tolist(),
             "folders": {**self._state["folders"], self._fingerprint: folder},
+            "evaluated": {"epoch": self._evaluated_epoch, "updates": self._evaluated_updates},
         }
         setattr(self.model, EVALUATIONS, state)
 
@@ -397,9 +393,7 @@ class FixedSetEvalCallback(BestPairOwner):
         if self.folder is not None:
             if improved and self.owned_folder is not None:
                 self._save_best_pair(self.owned_folder)
-            self.history.save(self.folder / self.results_file, self.n_samples)
-            if self.sets.is_grid:
-                write_atomically(self.folder / TABLE_FILE, self.table.text())
+            self._save_history(self.folder)
         self._report(result, improved)
         pause = self._now() - self._clock_start - seconds
         for callback in (self, *siblings(self, FixedSetEvalCallback)):
@@ -411,6 +405,11 @@ class FixedSetEvalCallback(BestPairOwner):
         :param pause: ``(2,)``, wall and CPU seconds that are no training time, such as those of an evaluation
         """
         self._clock_start = self._clock_start + pause
+
+    def _save_history(self, folder: Path) -> None:
+        self.history.save(folder / self.results_file, self.n_samples)
+        if self.sets is not None and self.sets.is_grid:
+            write_atomically(folder / TABLE_FILE, self.table.text())
 
     def _save_best_pair(self, folder: Path) -> None:
         router = None if self._its is None else self._its.router
@@ -429,7 +428,8 @@ class FixedSetEvalCallback(BestPairOwner):
 
     def _report(self, result: FixedSetResult, improved: bool) -> None:
         if self._described_in != self.logger.dir:
-            self._describe()
+            metrics = ["eval/fixed_greedy", "eval/fixed_best", *(["eval/fixed_sampled"] if self.n_samples > 0 else [])]
+            record_settings(self.model, self._policy, self._its, metrics)
             self._described_in = self.logger.dir
         text = f"greedy {result.greedy.mean():.2f}"
         self.logger.record("eval/fixed_greedy", float(result.greedy.mean()))
