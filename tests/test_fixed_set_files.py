@@ -271,27 +271,31 @@ for flags in ({[*flags, "--eval-freq", "60"]}, {[*flags, *again]}):
     assert evaluate_fixed_set(best, problem, instances, 0).greedy.mean() == history.results.mean(1).max()  # type: ignore[arg-type]
 
 
-class KillBeforeEvaluation(FixedSetEvalCallback):
-    """Ends the run when the given number of evaluations has been made, as a kill between checkpoint and evaluation does."""
+class Killed(FixedSetEvalCallback):
+    """Ends the run right before or after an evaluation, as a kill does."""
 
-    number = 3
+    number, is_after = 3, False
 
     def evaluate(self) -> float:
-        if len(self.history.timesteps) == self.number:
+        is_due = len(self.history.timesteps) == self.number
+        if is_due and not self.is_after:
             raise KeyboardInterrupt
-        return super().evaluate()
+        score = super().evaluate()
+        if is_due:
+            raise KeyboardInterrupt
+        return score
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("is_after", [False, True])
 @pytest.mark.parametrize("settings", [{}, dict(eval_updates=2), dict(sizes=[[2, 5, 4], [2, 6, 3]])])
-def test_an_evaluation_that_was_due_is_made_up_for(settings, tmp_path, monkeypatch):
+def test_an_evaluation_that_was_due_is_made_up_for(settings, is_after, tmp_path, monkeypatch):
     """The checkpoint of an epoch comes first. A second kill, before the new folder has an evaluation, loses nothing either."""
     router = dict(policy="RouterPolicy", n_envs=N_ENVS, policy_kwargs=NETWORK, seed=1)
-    common = dict(n_instances=None if "sizes" in settings else 6, n_samples=3, seed=0, **settings)
-    common = {key: value for key, value in common.items() if value is not None}
+    common = {**({} if "sizes" in settings else dict(n_instances=6)), "n_samples": 3, **settings}
 
     def callbacks(folder: Path, evaluation: type[FixedSetEvalCallback] = FixedSetEvalCallback) -> list[Any]:
-        its = ITSCallback(router, n_epochs=4, n_pretraining_epochs=1, save_path=folder)
+        its = ITSCallback(router, n_epochs=6, n_pretraining_epochs=1, save_path=folder)
         return [its, evaluation(save_path=folder, **common)]
 
     def resume(folder: Path) -> Any:
@@ -303,10 +307,12 @@ def test_an_evaluation_that_was_due_is_made_up_for(settings, tmp_path, monkeypat
     make_model(REINFORCE).learn(limit, callback=callbacks(tmp_path / "unbroken"))
     first, second, third = (tmp_path / name for name in ("first", "second", "third"))
     with pytest.raises(KeyboardInterrupt):
-        make_model(REINFORCE).learn(limit, callback=callbacks(first, KillBeforeEvaluation))
-    monkeypatch.setattr(KillBeforeEvaluation, "number", 4)
+        monkeypatch.setattr(Killed, "is_after", is_after)
+        make_model(REINFORCE).learn(limit, callback=callbacks(first, Killed))
+    monkeypatch.setattr(Killed, "is_after", False)
+    monkeypatch.setattr(Killed, "number", 4)
     with pytest.raises(KeyboardInterrupt):
-        resume(first).learn(limit, callback=callbacks(second, KillBeforeEvaluation))
+        resume(first).learn(limit, callback=callbacks(second, Killed))
     resume(second).learn(limit, callback=callbacks(third))
     found, unbroken = load(third), load(tmp_path / "unbroken")
     for name in ("timesteps", "results", "sampled", "ep_lengths"):

@@ -205,10 +205,12 @@ class FixedSetEvalCallback(BestPairOwner):
                 # Zips name this folder from now on.
                 self._save_history(self.folder)
         self._learned_steps = self.model.num_timesteps
-        # Before the evaluation that is due now, if the earlier run ended between its checkpoint and that.
-        evaluated = self._state.get("evaluated", {})
-        self._evaluated_epoch = min(self._epoch() or 0, evaluated.get("epoch", np.inf))
-        self._evaluated_updates = min(n_updates(self.model), evaluated.get("updates", np.inf))
+        self._evaluated_epoch, self._evaluated_updates = self._epoch() or 0, n_updates(self.model)
+        if not np.any(self.history.timesteps >= self._timesteps):
+            # The earlier run may have ended between a checkpoint and the evaluation that was due.
+            evaluated = self._state.get("evaluated", {})
+            self._evaluated_epoch = min(self._evaluated_epoch, evaluated.get("epoch", self._evaluated_epoch))
+            self._evaluated_updates = min(self._evaluated_updates, evaluated.get("updates", self._evaluated_updates))
         self._note_state(self._now() - self._clock_start)
         self._ready = True
 

@@ -154,7 +154,9 @@ class SizeTable:
         try:
             reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
             rows = [{name: float(value) for name, value in row.items()} for row in reader]
-        except (ValueError, TypeError, AttributeError, csv.Error) as error:
+            # As they were written.
+            rows = [{name: int(value) if name == "updates" else value for name, value in row.items()} for row in rows]
+        except (ValueError, OverflowError, TypeError, AttributeError, csv.Error) as error:
             raise ValueError(f"{path}: not an intact table of numbers ({error!s:.300}); delete it.") from error
         expected = ["updates", "seconds", *columns, "score"]
         for row in rows:
