@@ -1,6 +1,9 @@
 """Micro-batches: the same update with less memory."""
 
+import gc
 import re
+import runpy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ from stable_baselines3.common.logger import Logger
 from sb3_uav.envs import UniformGenerator
 from sb3_uav.policies import memory
 from sb3_uav.reinforce import REINFORCE, memory_estimate, micro_batches
+from sb3_uav.training.fixed_set_returns import draw_fixed_set, evaluate_fixed_set
 
 
 def gradient(level: str, baseline: str, micro_batch_size: int | None, **kwargs: Any) -> tuple[th.Tensor, Any]:
@@ -135,3 +139,35 @@ def test_the_limits_of_a_container_count(tmp_path, monkeypatch):
     assert memory.available_memory(th.device("cpu")) == 1000
     monkeypatch.setattr(memory, "_free_of_the_group", lambda: None)
     assert memory.available_memory(th.device("cpu")) is None
+
+
+def test_the_benchmark_measures(capsys):
+    """Its text names sizes, estimates and peaks."""
+    benchmark = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "memory.py"))
+    threads = th.get_num_threads()
+    benchmark["measure_peak"]("router:12:4:2", 2)
+    benchmark["print_estimate"]("allocator:6:4", 2)
+    th.set_num_threads(threads)
+    peak, estimated = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"router:12:4:2: estimated \d\.\d\d GiB, measured \d\.\d\d GiB, ratio \S+", peak)
+    assert re.match(r"allocator:6:4: estimated 0\.\d\d GiB, available ", estimated)
+
+
+def n_tensors() -> int:
+    gc.collect()
+    return sum(issubclass(type(found), th.Tensor) for found in gc.get_objects())
+
+
+@pytest.mark.parametrize(("level", "size"), [("allocator", 2), ("router", None)])
+def test_no_tensors_pile_up(level, size):
+    """After the first updates, the optimizer has its state, and nothing is added."""
+    model = make_model(level, micro_batch_size=size).learn_instances(8)
+    before = n_tensors()
+    model.learn_instances(40)
+    assert n_tensors() == before
+    problem, policy = model.problem, model.policy
+    evaluate_fixed_set(policy, problem, draw_fixed_set(problem, 4, 0), 2)
+    before = n_tensors()
+    for seed in range(4):
+        evaluate_fixed_set(policy, problem, draw_fixed_set(problem, 4, seed), 2)
+    assert n_tensors() == before

@@ -76,6 +76,20 @@ def diverged(model: Any, what: str, value: float, remedy: str = SMALLER_STEPS, u
     return DivergenceError(f"{level_of(model)}: The {what} is {value} {when}; {done}. {good}; {from_zip}train with {remedy}.")
 
 
+def with_checkpoint(error: DivergenceError, model: Any) -> str:
+    """
+    :param error: An error of the policy, which does not know what has been saved
+    :param model: The algorithm that learns
+    :return: Its message, with the last good checkpoint
+    """
+    text = str(error)
+    if "checkpoint" in text:
+        return text
+    saved = last_saved(model)
+    good = "No checkpoint has been saved yet" if saved is None else f"The last good checkpoint is {saved}"
+    return f"{text} This was after {model.num_timesteps} steps. {good}."
+
+
 def first_bad(tensor: th.Tensor) -> float | None:
     """
     :param tensor: Numbers

@@ -19,6 +19,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_uav.common.divergence import SMALLER_STEPS, DivergenceError, first_bad, level_of
 from sb3_uav.common.imports import import_object
 from sb3_uav.common.random_streams import exponential_noise
 from sb3_uav.policies.extractor import EncodeOnceExtractor
@@ -247,10 +248,21 @@ class MaskedPolicy(MaskableActorCriticPolicy):
         :param action_masks: The mask of each; that of the observation when None
         :return: The masked distribution
         :raises ValueError: If a row has no legal action
+        :raises DivergenceError: If a score is NaN
         """
         mask = self._mask(obs, logits, action_masks)
-        distribution = self.action_dist.proba_distribution(action_logits=logits)
-        distribution.apply_masking(mask)
+        try:
+            distribution = self.action_dist.proba_distribution(action_logits=logits)
+            distribution.apply_masking(mask)
+        except ValueError as error:
+            # Torch's own message prints the scores.
+            bad = None if is_recorded() else first_bad(logits)
+            if bad is None:
+                raise
+            raise DivergenceError(
+                f"{level_of(self)}: The score of an action is {bad}, because weights or observations are not finite, or far "
+                f"too large; train with {SMALLER_STEPS}."
+            ) from error
         return distribution
 
     def forward(

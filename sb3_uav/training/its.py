@@ -12,7 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_uav.common import distributed
 from sb3_uav.common.callback_tree import siblings
-from sb3_uav.common.divergence import DivergenceError
+from sb3_uav.common.divergence import DivergenceError, with_checkpoint
 from sb3_uav.common.epoch_log import LOG_FILE, EpisodeStatistics, EpochRecord, Moment, log_text
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.random_state import undisturbed_random_state
@@ -382,7 +382,7 @@ class ITSCallback(RouterCallback):
             except DivergenceError as error:
                 # rl_zoo3 ends the training even after an error, but this router must not be saved.
                 self._started = False
-                raise DivergenceError(f"Router epoch {number} ({phase}), {error}") from error
+                raise DivergenceError(f"Router epoch {number} ({phase}), {with_checkpoint(error, self.router)}") from error
             finally:
                 close_bar()
             generation = self._generation_seconds() - generated_before

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common import distributed
-from sb3_uav.common.divergence import note_saved, require_finite_model
+from sb3_uav.common.divergence import DivergenceError, note_saved, require_finite_model, with_checkpoint
 from sb3_uav.common.interruption import Interruption
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
@@ -158,6 +158,8 @@ class UAVExperimentManager(ExperimentManager):
         except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
+        except DivergenceError as error:
+            raise DivergenceError(f"{self._where}: {with_checkpoint(error, model)}") from error
         except ValueError as error:
             # Others as well, those of the router above all, which is made then.
             if str(self.config) in str(error):

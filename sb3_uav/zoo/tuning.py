@@ -193,7 +193,7 @@ def has_success(env_id: str, env_kwargs: _Params) -> bool:
 
 class StopWhenDiverged(BaseCallback):
     """
-    Stops a training whose parameters are no longer finite, which the fused driver does not detect.
+    Stops a training whose parameters are no longer finite.
 
     :raises ValueError: At the start of a rollout; ``-optimize`` prunes a trial on it
     """
