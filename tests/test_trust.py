@@ -129,8 +129,8 @@ def test_replaying_and_continuing_execute_nothing(
 
 HOSTILE = {
     "config.yml": {
-        "!!python/object/apply:os.system ['touch executed']": "cannot be read as plain YAML",
-        "a: !!python/name:os.system": "cannot be read as plain YAML",
+        "!!python/object/apply:os.system ['touch executed']": "cannot be read as YAML",
+        "a: !!python/name:os.system": "cannot be read as YAML",
         "env_wrapper: subprocess.Popen": "env_wrapper names code",
         "vec_env_wrapper: [{os.system: {}}]": "vec_env_wrapper names code",
         "normalize: \"__import__('os').system('touch executed')\"": "normalize is code",
@@ -140,7 +140,7 @@ HOSTILE = {
     },
     "args.yml": {
         "env_kwargs: {generator: os.system}": "env_kwargs names code",
-        "env_kwargs: !!python/object/apply:os.system ['touch executed']": "cannot be read as plain YAML",
+        "env_kwargs: !!python/object/apply:os.system ['touch executed']": "cannot be read as YAML",
     },
 }
 
