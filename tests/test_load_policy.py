@@ -171,7 +171,8 @@ def test_parameters_that_are_not_finite(number: float, tmp_path: Path) -> None:
     model = make_model(REINFORCE)
     with th.no_grad():
         model.policy.features_extractor.encoder.embed_task.bias[3] = number
-    model.save(tmp_path / "diverged.zip")
+    # REINFORCE refuses to write it.
+    BaseAlgorithm.save(model, tmp_path / "diverged.zip")
     message = error_of(tmp_path / "diverged.zip")
     assert f"'features_extractor.encoder.embed_task.bias' holds {number}" in message and "earlier checkpoint" in message
 

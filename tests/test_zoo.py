@@ -132,7 +132,10 @@ def test_enjoy_plays_policies_with_code_of_the_user(tmp_path, capsys, monkeypatc
 
     for name in ("set_task_order", "set_router"):
         monkeypatch.setattr(TaskAllocationEnv, name, spy(name))
-    assert enjoy.main(["--env", ENV, "-f", str(tmp_path / "logs"), "-n", "20", "--no-render"]) == 0
+    replay = ["--env", ENV, "-f", str(tmp_path / "logs"), "-n", "20", "--no-render"]
+    assert enjoy.main(replay) == 2
+    assert "features_extractor_class" in (error := capsys.readouterr().err) and "Add --trust if you trust" in error
+    assert enjoy.main([*replay, "--trust"]) == 0
     assert "1 Episodes" in capsys.readouterr().out and given["set_task_order"] == "sweep"
     assert type(given["set_router"].__self__.features_extractor) is SUBCLASSES["router"]
 

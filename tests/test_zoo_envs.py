@@ -238,7 +238,10 @@ def test_arguments_reach_training_evaluation_and_replay(tmp_path: Path, capsys: 
     assert "is_success" not in (run / "0.monitor.csv").read_text()
     assert load_policy(run / f"{GENERIC}.zip") is not None
     capsys.readouterr()
-    assert enjoy.main(["--algo", "ppo", "--env", GENERIC, "-f", str(tmp_path / "logs"), "-n", "18", "--no-render"]) == 0
+    replay = ["--algo", "ppo", "--env", GENERIC, "-f", str(tmp_path / "logs"), "-n", "18", "--no-render"]
+    assert enjoy.main(replay) == 2
+    assert "env_kwargs names code, 'zoo_hooks." in capsys.readouterr().err
+    assert enjoy.main([*replay, "--gym-packages", "zoo_hooks"]) == 0
     printed = capsys.readouterr().out
     rewards = {float(found) for found in re.findall(r"Episode Reward: ([\d.]+)", printed)}
     assert "2 Episodes" in printed and rewards <= {1.0, 2.0}

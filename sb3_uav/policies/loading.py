@@ -99,7 +99,7 @@ def load_policy(
     Load the allocator or the router from the zip of any SB3 algorithm (REINFORCE, PPO, A2C, MaskablePPO).
 
     Unlike the algorithm's own ``load``, this unpickles nothing, so that a zip from a stranger is safe to open: it reads the
-    plain JSON of the zip, and its tensors with ``weights_only=True``.
+    plain JSON of the zip and its tensors, see :mod:`sb3_uav.common.tensor_file`.
 
     :param path: The zip; ``.zip`` is appended if there is no such file, as SB3 does
     :param device: Device on which the policy should run

@@ -9,9 +9,9 @@ import yaml
 from sb3_uav.zoo.tuning import problem_env_class
 
 _UNPICKLING = """\
-> **Only replay agents whose owner you trust.** SB3's zips hold pickles: `enjoy` and `REINFORCE.load`, like `load` of every SB3
-> algorithm, run whatever code is in them. `sb3-uav evaluate` and `sb3_uav.policies.loading.load_policy` do not: they read the
-> plain JSON and the tensors only.
+> **Only replay agents whose owner you trust.** SB3's zips hold pickles: `REINFORCE.load`, like `load` of every SB3 algorithm,
+> and `enjoy --trust` run whatever code is in them. `sb3-uav enjoy` without it, `sb3-uav evaluate` and
+> `sb3_uav.policies.loading.load_policy` do not: they read the plain JSON and the tensors only.
 """
 
 
@@ -137,7 +137,9 @@ class Card(NamedTuple):
         chosen = f"--algo {self.algo} --env {self.env_id} -f logs --exp-id 1"
         repository = f"-orga {self.organization}" + (f" -name {self.repo_name}" if self.repo_name else "")
         load = f"sb3-uav load-from-hub {chosen} {repository}"
-        enjoy = f"sb3-uav enjoy {chosen} --trust"
+        # Others can only be unpickled.
+        is_ours = str(self.hyperparams.get("policy")).rpartition(".")[2] in ("AllocatorPolicy", "RouterPolicy")
+        enjoy = f"sb3-uav enjoy {chosen}" + ("" if is_ours else " --trust")
         solver = f"dl-drl:allocator={run}/{name}.zip,router={run}/router.zip"
         evaluate = f"sb3-uav evaluate --instances my_instances.npz --solvers {solver} ortools --out results"
         return "\n".join(["```bash", load, *([evaluate] if self.has_router else []), enjoy, "```"])

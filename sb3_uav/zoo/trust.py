@@ -86,7 +86,11 @@ def require_plain_run(run_folder: Path, env_name: str, trust: bool, packages: Co
             raise ValueError(f"{path}: normalize is code, {found['normalize']!r:.100}. {_remedy(run_folder)}")
         for text in _texts(found.get("env_kwargs")):
             if _names_code(text, packages):
-                raise ValueError(f"{path}: env_kwargs names code, {text!r:.100}. {_remedy(run_folder)}")
+                name = text.strip().partition(".")[0]
+                raise ValueError(
+                    f"{path}: env_kwargs names code, {text!r:.100}. {_remedy(run_folder)} For code of your own, "
+                    f"--gym-packages {name:.60} is enough."
+                )
 
 
 def require_plain_neighbors(zip_file: Path, env_name: str, trust: bool) -> None:
