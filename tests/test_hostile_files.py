@@ -136,6 +136,20 @@ def test_settings_of_an_evaluation_of_other_kinds(tmp_path: Path, field: str, va
         evaluate([solver], instances, tmp_path, resume=True)
 
 
+@pytest.mark.parametrize(("column", "value"), [("unserved", -(2**40)), ("batch_size", 10**30), ("instance", -1)])
+def test_counts_in_results_that_are_none(tmp_path: Path, column: str, value: int) -> None:
+    """They do not fit into the columns that hold them, or name another row from the end."""
+    instances, solver = UniformGenerator(4, 2)(2, np.random.default_rng(0)), make_solver("greedy-insertion")
+    evaluate([solver], instances, tmp_path)
+    path = tmp_path / "results.csv"
+    header, *rows = path.read_text().splitlines()
+    cells = rows[0].split(",")
+    cells[header.split(",").index(column)] = str(value)
+    path.write_text("\n".join([header, ",".join(cells), *rows[1:]]) + "\n")
+    with pytest.raises(ValueError, match=rf"results\.csv, line 2: is damaged \({column} is {value}\)"):
+        evaluate([solver], instances, tmp_path, resume=True)
+
+
 @pytest.mark.parametrize("data", [b"\xff", b"epoch,level\0", b'epoch,level,phase,objective\n1,"' + b"a" * 200_000])
 def test_a_log_that_is_no_csv_is_named(tmp_path: Path, data: bytes) -> None:
     pytest.importorskip("matplotlib")

@@ -49,12 +49,12 @@ def read_index(
     for line, row in iterate_results(path):
         if row.solver not in solvers or row.source not in [one["name"] for one in sets]:
             raise ValueError(
-                f"{path}, line {line.number}: holds results of {row.solver!r} on {row.source!r}, of which "
+                f"{path}, line {line.number}: holds results of {row.solver!r:.80} on {row.source!r:.80}, of which "
                 f"{SETTINGS_FILE} holds no description; choose another folder, or start over with --overwrite."
             )
         number = bisect_right(ends, row.instance)
         if row.instance >= ends[-1] or sets[number]["name"] != row.source:
-            raise damaged(path, line, f"instance is {row.instance}, which is not one of {row.source!r}")
+            raise damaged(path, line, f"instance is {row.instance}, which is not one of {row.source!r:.80}")
         if row.status == FAILED and row.time_limit is not None and row.solver in without_limit:
             continue
         run = index.of(row.key)
