@@ -11,6 +11,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "extensions")]
 
 project = "sb3_uav"
 author = "the sb3_uav contributors"
+copyright = f"{author}, MIT license"
 release = version = (ROOT / "sb3_uav" / "version.txt").read_text(encoding="utf-8").strip()
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "python_links", "repository_links"]
