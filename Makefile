@@ -16,7 +16,7 @@ BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard ben
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: install demo docs test test-fast lint format check-codestyle type commit-checks bench clean help
+.PHONY: install demo docs notebooks test test-fast lint format check-codestyle type commit-checks bench clean help
 
 install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
 
@@ -33,6 +33,9 @@ demo: $(INSTALLED)  ## Train a small scenario, evaluate it against heuristics an
 
 docs: $(INSTALLED)  ## Build the documentation site into docs/_build/html; any warning is an error
 	$(BIN)/python -m sphinx -b html -W --keep-going -n docs docs/_build/html
+
+notebooks: $(INSTALLED)  ## Run the notebooks of the docs and store their outputs
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/run_notebooks.py
 
 # One process per core, and one thread in each: threads that wait for a busy core cost more than they bring.
 test: $(INSTALLED)  ## Run the whole test suite

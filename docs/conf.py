@@ -11,15 +11,16 @@ sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "extensions")]
 
 project = "sb3_uav"
 author = "the sb3_uav contributors"
+copyright = f"{author}, MIT license"
 release = version = (ROOT / "sb3_uav" / "version.txt").read_text(encoding="utf-8").strip()
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "python_links", "repository_links"]
-exclude_patterns = ["_build", "notebooks/*.py"]
+exclude_patterns = ["_build"]
 
 # Markdown as on GitHub, with the same anchors; and fenced directives, which both show.
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 6
-# Notebooks are stored with their outputs, which `make notebooks` writes and tests/test_notebooks.py checks.
+# Notebooks are stored with their outputs, which `make notebooks` writes and tests/test_docs_site.py checks.
 nb_execution_mode = "off"
 
 autodoc_member_order = "bysource"
@@ -35,8 +36,6 @@ html_static_path = ["_static"]
 html_css_files = ["sb3_uav.css"]
 html_show_sourcelink = False
 html_copy_source = False
-# Prompts and comments of commands are no part of what is copied.
-copybutton_exclude = ".linenos, .gp"
 
 
 def setup(app: Sphinx) -> None:

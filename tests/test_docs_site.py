@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -69,6 +71,16 @@ def pages(site: Path) -> dict[Path, Page]:
     }
 
 
+def repository_links() -> Any:
+    """:return: The extension of the site that resolves links into the repository"""
+    pytest.importorskip("sphinx")
+    spec = importlib.util.spec_from_file_location("repository_links", DOCS / "extensions" / "repository_links.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.mark.slow
 def test_every_page_is_reached_from_the_navigation(site: Path, pages: dict[Path, Page]) -> None:
     """Sphinx warns, which fails the build; but pages that say `orphan` are exempt from that."""
@@ -114,10 +126,7 @@ def test_pages_load_nothing_from_elsewhere(site: Path, pages: dict[Path, Page]) 
 @pytest.mark.slow
 def test_links_into_the_repository_name_files_that_exist(pages: dict[Path, Page]) -> None:
     """On the site they lead to the repository on the web."""
-    sys.path.insert(0, str(DOCS / "extensions"))
-    from repository_links import repository_url
-
-    url = repository_url()
+    url = repository_links().repository_url()
     assert url is not None
     found = {link for page in pages.values() for link in page.links if re.match(rf"{re.escape(url)}/(blob|tree)/main/", link)}
     assert any(link.endswith("examples/knapsack.py") for link in found)
@@ -126,10 +135,7 @@ def test_links_into_the_repository_name_files_that_exist(pages: dict[Path, Page]
 
 
 def test_included_pages_exist() -> None:
-    sys.path.insert(0, str(DOCS / "extensions"))
-    from repository_links import INCLUDED
-
-    for file, page in INCLUDED.items():
+    for file, page in repository_links().INCLUDED.items():
         assert (ROOT / file).is_file() and (DOCS / f"{page}.md").is_file()
         text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
         assert page == "index" or f"{{include}} {'../' * (page.count('/') + 1)}{file}" in text
