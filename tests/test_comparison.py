@@ -14,9 +14,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_uav.common.statistics import confidence_halfwidth
+from sb3_uav.evaluation.result_index import Figures, Place
 from sb3_uav.evaluation.results import FAILED, INFEASIBLE, OK, ResultRow
-from sb3_uav.evaluation.summary import _SUMMARY_COLUMNS, _optimality_gap, gaps, summarize, write_summary
+from sb3_uav.evaluation.summary import _SUMMARY_COLUMNS, SummaryRow, _optimality_gap, gaps, write_summary
+from sb3_uav.evaluation.summary import summarize as summarize_figures
 from sb3_uav.evaluation.table import print_table
+
+FIRST = 10
+
+
+def summarize(
+    source: str, results: dict[str, list[ResultRow]], reference: str, time_limit: float | None = None
+) -> list[SummaryRow]:
+    """Of results one by one, as they stand in files."""
+    figures = {}
+    for solver, rows in results.items():
+        whole = Figures(FIRST + len(rows))
+        for row in rows:
+            whole.set(row, Place(0, 0))
+        figures[solver] = whole.selected(np.arange(FIRST, FIRST + len(rows)))
+    return summarize_figures(source, np.arange(len(rows)), figures, reference, time_limit)
 
 
 def make_rows(solver: str, objectives: list[float | None], bounds: list[float | None] | None = None) -> list[ResultRow]:
@@ -24,7 +41,7 @@ def make_rows(solver: str, objectives: list[float | None], bounds: list[float | 
     return [
         ResultRow(
             solver=solver,
-            instance=10 + i,
+            instance=FIRST + i,
             n_uavs=2,
             n_tasks=5,
             objective=objective,

@@ -295,7 +295,7 @@ def test_an_evaluation_that_was_due_is_made_up_for(settings, is_after, tmp_path,
     common = {**({} if "sizes" in settings else dict(n_instances=6)), "n_samples": 3, **settings}
 
     def callbacks(folder: Path, evaluation: type[FixedSetEvalCallback] = FixedSetEvalCallback) -> list[Any]:
-        its = ITSCallback(router, n_epochs=6, n_pretraining_epochs=1, save_path=folder)
+        its = ITSCallback(router, n_epochs=6, n_pretraining_epochs=1, save_path=str(folder))
         return [its, evaluation(save_path=folder, **common)]
 
     def resume(folder: Path) -> Any:

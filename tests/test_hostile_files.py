@@ -67,7 +67,7 @@ def _saved(content: Any) -> bytes:
 
 
 def test_plain_tensors_are_read() -> None:
-    content = {"a": th.arange(3), "b": [th.ones(2, 2).T, {"c": 1.5}], "empty": th.zeros(0, 4)}
+    content: dict[str, Any] = {"a": th.arange(3), "b": [th.ones(2, 2).T, {"c": 1.5}], "empty": th.zeros(0, 4)}
     read = load_tensors(_saved(content))
     assert th.equal(read["a"], content["a"]) and read["b"][1] == {"c": 1.5} and read["empty"].shape == (0, 4)
 

@@ -51,7 +51,7 @@ def test_any_partition_merges_to_the_whole(data: st.DataObject, tmp_path: Path) 
         for number, size in enumerate(sizes)
     }
     shutil.rmtree(tmp_path)
-    run = dict(seed=3, time_limits=(1.0, 2.0))
+    run: dict[str, Any] = dict(seed=3, time_limits=(1.0, 2.0))
     whole = evaluate(solvers(sets["set 0"]), sets, tmp_path / "whole", **run)
     for number in order:
         evaluate(solvers(sets["set 0"]), sets, tmp_path / str(number), shard=Shard(number, count), **run)
@@ -146,7 +146,12 @@ def test_a_set_in_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         UniformGenerator(5, n_uavs=2)(size, np.random.default_rng(number)).save(tmp_path / "set" / f"{number}.npz")
     loaded: list[str] = []
     load = Instances.load.__func__  # type: ignore[attr-defined]
-    monkeypatch.setattr(Instances, "load", classmethod(lambda cls, path: [loaded.append(path.stem), load(cls, path)][1]))
+
+    def noted(cls: type[Instances], path: Path) -> Instances:
+        loaded.append(path.stem)
+        return load(cls, path)
+
+    monkeypatch.setattr(Instances, "load", classmethod(noted))
     sets = files_of([tmp_path / "set"])
     (row,) = evaluate([Nearest()], sets, tmp_path / "out")
     assert row.source == "set" and row.n_instances == 6
