@@ -50,6 +50,7 @@ class Reader:
     :param change: Damages one: takes a random generator, the content and all others
     :param read: Reads the file; returns or raises an error that names it
     :param beside: Further files of its folder, written before each case
+    :param may_take_long: Whether time that is up is no failure: a training of a thousand epochs is legal
     :param must_name: What the message must contain, if not the name of the file; if nothing, it may be as long as what is read
     """
 
@@ -61,6 +62,7 @@ class Reader:
     read: Callable[[Path], Any]
     beside: Mapping[str, bytes] = field(default_factory=dict)
     must_name: str | None = None
+    may_take_long: bool = False
 
 
 def all_readers() -> list[Reader]:
@@ -192,7 +194,7 @@ def _settings() -> list[Reader]:
     return [
         Reader("YAML configs", 14, "conf.yml", [_config()], mutations.yaml_changed(), read_config),
         Reader("YAML of runs", 5, "args.yml", [saved, _config()], mutations.yaml_changed(blindly=1.0), read_saved),
-        Reader("YAML configs, trained", 1, "conf.yml", [_config()], run, _train, must_name="conf.yml"),
+        Reader("YAML configs, trained", 1, "conf.yml", [_config()], run, _train, must_name="conf.yml", may_take_long=True),
         Reader("solver specs", 6, "spec.txt", specs, mutations.bytes_changed, _make_solver, must_name=""),
     ]
 

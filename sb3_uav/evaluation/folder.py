@@ -149,7 +149,10 @@ class EvaluationFolder:
         # Instances are numbered through all sets, so that one list must be the beginning of the other.
         for before, now in zip(sources, settings["instances"], strict=False):
             if before != now:
-                pair = [f"{source['name']} ({source['n_instances']}, {str(source['sha256'])[:8]})" for source in (before, now)]
+                pair = [
+                    f"{source['name']!s:.80} ({source['n_instances']}, {str(source['sha256'])[:8]})"
+                    for source in (before, now)
+                ]
                 raise ValueError(
                     f"{self.folder}: holds results of other instances: {pair[0]}, not {pair[1]}; give the same "
                     f"files in the same order, {remedy}."

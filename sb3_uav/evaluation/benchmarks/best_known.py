@@ -40,11 +40,11 @@ def read_best_known(path: Path) -> dict[str, float]:
         try:
             value = finite_number(text)
         except ValueError:
-            raise ValueError(f"{where}: best_known of {name!r} is {text!r:.40}; it must be a finite number.") from None
+            raise ValueError(f"{where}: best_known of {name!r:.80} is {text!r:.40}; it must be a finite number.") from None
         if value < 0:
-            raise ValueError(f"{where}: best_known of {name!r} is {text}; it must be at least 0.")
+            raise ValueError(f"{where}: best_known of {name!r:.80} is {text}; it must be at least 0.")
         if values.setdefault(name, value) != value:
-            raise ValueError(f"{where}: best_known of {name!r} is {text}, but {values[name]:g} in a line before; keep one.")
+            raise ValueError(f"{where}: best_known of {name!r:.80} is {text}, but {values[name]:g} in a line before; keep one.")
     if not values:
         raise ValueError(f"{path}: holds no best-known value; add a line for every instance.")
     return values
