@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from sb3_uav.bounds.column_generation import ColumnGeneration
 from sb3_uav.bounds.places import Places, value_unit
+from sb3_uav.common.random_streams import WARM_UP_SEED, keyed_generator
+from sb3_uav.envs.generators import UniformGenerator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.envs.schedule import Schedule, check_schedule
 from sb3_uav.local_search import LocalSearch
@@ -60,6 +60,13 @@ def upper_bound(
         raise ValueError(f"There are {len(incumbents)} schedules for {len(instances)} instances; give one of each, or None.")
     given = incumbents or [None] * len(instances)
     return [_bound_one(instances[row], time_limit, given[row], clock) for row in range(len(instances))]
+
+
+def warm_up() -> None:
+    """
+    Load the compiled code, or compile it where that has never been done: seconds that should not count against a time limit.
+    """
+    upper_bound(UniformGenerator(12, n_uavs=2, max_distance=1.0)(1, keyed_generator(WARM_UP_SEED)), 1.0)
 
 
 def _bound_one(instance: Instances, time_limit: float, incumbent: Schedule | None, clock: Callable[[], float]) -> Bound:

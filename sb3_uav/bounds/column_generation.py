@@ -19,9 +19,14 @@ _SMOOTHING = 0.5
 # What is worth less, in units of the greatest value, is a rounding error.
 _TOLERANCE = 1e-7
 # How many labels an exact search writes at first and at last, and a fast one.
-_FIRST_LABELS, _LAST_LABELS, _FAST_LABELS = 100_000, 4_000_000, 200_000
-# Thresholds of exact searches are raised to at most this part of the way to what routes are worth at most.
-_HIGHEST = 0.9
+_FIRST_LABELS, _LAST_LABELS, _FAST_LABELS = 1_000_000, 4_000_000, 200_000
+# Where an exact search fails, its threshold is raised by this part of the way to what routes are worth at most, as far as that.
+_RISE, _HIGHEST = 0.15, 0.9
+# An exact search may take this part of the time that is left, a search for a first bound that one, which is due whenever only
+# this part of the time is left that was left after the last one.
+_EXACT_SHARE, _PROBE_SHARE, _PROBING = 0.5, 0.2, 0.6
+# How many exact searches with all the memory there is may fail.
+_MOST_FAILURES = 3
 # Of more routes than so many per place, those that are far from being taken are forgotten.
 _MOST_ROUTES_PER_PLACE = 60
 
@@ -50,7 +55,8 @@ class ColumnGeneration:
         self._memory = LabelMemory()
         # All places at their full value: no route is worth more.
         self._inner = Prices(self._values.copy(), np.zeros(len(self._n_uavs)), math.fsum(self._values))
-        self._height = np.zeros(len(self._n_uavs))
+        self._n_failures = 0
+        self._next_probe = seconds_left() * _PROBING
         self._n_labels = np.full(len(self._n_uavs), _FIRST_LABELS)
         self.is_finished = False
 
@@ -84,34 +90,32 @@ class ColumnGeneration:
             self._remember_more()
             return
         self._forget(outer)
-        smoothing = _SMOOTHING
-        while not self._is_late():
+        probes = self._seconds_left() < self._next_probe
+        for smoothing in (_SMOOTHING, 0.0):
             prices = Prices(
                 smoothing * self._inner.places + (1 - smoothing) * outer.places,
                 smoothing * self._inner.uavs + (1 - smoothing) * outer.uavs,
                 0.0,
             )
-            before = self._inner
-            if self._price(prices):
-                return
-            if self._inner is before:
-                if smoothing == 0.0:
-                    self._n_labels = np.minimum(self._n_labels * 2, _LAST_LABELS)
-                    self._stuck += 1
-                    if (self._n_labels == _LAST_LABELS).all() and self._stuck > 3:
-                        self.is_finished = True
-                    return
-                smoothing = 0.0
+            before = self._inner.value
+            if self._price(prices, probes or smoothing == 0.0, probes) or self._is_late():
+                break
+        else:
+            if self._inner.value == before:
+                # The exact search has failed: it may have more memory, and half of the time that is left.
+                self.is_finished = bool((self._n_labels >= _LAST_LABELS).all()) and self._n_failures > _MOST_FAILURES
+                self._n_labels = np.minimum(self._n_labels * 2, _LAST_LABELS)
+                self._n_failures += 1
             else:
-                self._stuck = 0
-                if self._inner.value - goal <= _TOLERANCE * max(1.0, goal):
-                    return
+                self._n_failures = 0
+        if probes:
+            self._next_probe = self._seconds_left() * _PROBING
 
-    _stuck = 0
-
-    def _price(self, prices: Prices) -> bool:
+    def _price(self, prices: Prices, exact: bool, probes: bool) -> bool:
         """
         :param prices: Any, >= 0
+        :param exact: Whether to search exactly if the fast search finds nothing
+        :param probes: Whether to search exactly in any case, for routes that are worth more than those found
         :return: Whether new routes were found
         """
         profits = np.maximum(self._values - prices.places, 0.0)
@@ -121,60 +125,50 @@ class ColumnGeneration:
         for kind in self._places.kinds:
             if self._is_late():
                 return False
-            kinds.append(Pricing(kind, kind.fleet(self._near, self._position), profits, self._memory))
+            kinds.append(Pricing(kind, *kind.fleets(self._near, self._position), profits, self._memory))
         self._accept(used, np.array([kind.most for kind in kinds]))
         thresholds = prices.uavs + _TOLERANCE
         n_new = 0
         for number, kind in enumerate(kinds):
             if kind.most > thresholds[number]:
-                found = kind.search(thresholds[number], False, _FAST_LABELS, self._is_late)
+                found = kind.search(float(thresholds[number]), False, _FAST_LABELS, self._is_late)
                 n_new += sum(self.master.add(number, route) for route in found.routes)
-        if n_new > 0 or self._is_late():
+                if probes and found.routes:
+                    thresholds[number] = max(sum(profits[place] for place in route) for route in found.routes) + _TOLERANCE
+        if (n_new > 0 and not probes) or not exact or self._is_late():
             return n_new > 0
         most = np.empty(len(kinds))
         for number, kind in enumerate(kinds):
-            routes, most[number] = self._exact(number, kind, float(thresholds[number]))
+            share = self._seconds_left() * (_PROBE_SHARE if probes else _EXACT_SHARE) / (len(kinds) - number)
+            routes, most[number] = self._exact(number, kind, float(thresholds[number]), share)
             n_new += sum(self.master.add(number, route) for route in routes)
         self._accept(used, most)
         return n_new > 0
 
-    def _exact(self, number: int, kind: Pricing, threshold: float) -> tuple[list[list[int]], float]:
+    def _exact(self, number: int, kind: Pricing, threshold: float, seconds: float) -> tuple[list[list[int]], float]:
         """
         Look for routes that are worth more than a threshold; if there are too many labels, than a higher one.
 
         :param number: Number of the kind
         :param kind: The kind at some prices
         :param threshold: What routes have to be worth
+        :param seconds: How long each of the searches may take, of which the next takes half
         :return: Routes, and what any route is worth at most
         """
-        most = kind.most
-        if most <= threshold:
-            return [], most
-        height, lowest = float(self._height[number]), 0.0
-        while not self._is_late():
+        height = 0.0
+        while kind.most > threshold and height < _HIGHEST and not self._is_late():
+            end = self._seconds_left() - seconds
             found = kind.search(
-                threshold + height * (kind.most - threshold), True, int(self._n_labels[number]), self._is_late
+                threshold + height * (kind.most - threshold),
+                True,
+                int(self._n_labels[number]),
+                lambda end=end: self._seconds_left() < end,
             )
-            most = min(most, found.most)
-            if found.routes:
-                if found.is_complete:
-                    self._height[number] = 0.0 if height < 0.05 else height / 2
-                return found.routes, most
-            if found.is_complete:
-                if height <= lowest:
-                    break
-                self._height[number] = height
-                height = lowest if height < 0.05 else (lowest + height) / 2
-                continue
-            if most < kind.most:
-                # A higher threshold has succeeded before.
-                break
-            lowest = height
-            if height > _HIGHEST:
-                break
-            height = (height + 1.0) / 2
-            self._height[number] = height
-        return [], most
+            if found.is_complete or found.routes:
+                return found.routes, found.most
+            height += _RISE * (1 - height)
+            seconds /= 2
+        return [], kind.most
 
     def _accept(self, places: np.ndarray, uavs: np.ndarray) -> None:
         """

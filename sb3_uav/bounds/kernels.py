@@ -84,7 +84,7 @@ class Fleet(NamedTuple):
     :param distances: ``(n, n)``, between places
     :param outward: ``(n,)``, from the start
     :param homeward: ``(n,)``, to the end
-    :param limit: ``(1,)``, how far such a UAV flies
+    :param limit: ``(2,)``, how far such a UAV flies, and half of it: so far labels go, from both ends
     :param near: ``(n, n_near)`` int64, the places that each remembers; -1 where there are fewer
     :param position: ``(n, n)`` int8, where the second place stands in ``near`` of the first; -1 for nowhere
     """
@@ -170,11 +170,29 @@ def remaining(grid, fleet, completion, profit, place, length, memory):
 
 
 @njit(cache=True, nogil=True)
+def _passed_on(fleet, place, following, memory):
+    """:return: What the following place remembers of what a place remembers, and of that place"""
+    passed = 0
+    position = fleet.position[following, place]
+    if position >= 0:
+        passed |= 1 << position
+    a = 0
+    while memory:
+        if memory & 1:
+            position = fleet.position[following, fleet.near[place, a]]
+            if position >= 0:
+                passed |= 1 << position
+        memory >>= 1
+        a += 1
+    return passed
+
+
+@njit(cache=True, nogil=True)
 def _insert(fleet, found, place, length, profit, memory, before, exact):
     """:return: Whether the label was new and not dominated"""
     labels, heads, tops = found.labels, found.heads, found.tops
     n_buckets = heads.shape[1]
-    bucket = min(int(length / fleet.limit[0] * n_buckets), n_buckets - 1)
+    bucket = min(int(length / fleet.limit[1] * n_buckets), n_buckets - 1)
     for b in range(bucket + 1):
         if tops[place, b] < profit:
             continue
@@ -230,7 +248,7 @@ def begin(grid, fleet, completion, profit, threshold, found, exact):
     found.state[:] = 0
     for place in range(len(profit)):
         length = fleet.outward[place]
-        if profit[place] <= 0.0 or length + fleet.homeward[place] > fleet.limit[0]:
+        if profit[place] <= 0.0 or length > fleet.limit[1] or length + fleet.homeward[place] > fleet.limit[0]:
             continue
         if profit[place] + remaining(grid, fleet, completion, profit, place, length, 0) > threshold:
             _insert(fleet, found, place, length, profit[place], 0, -1, exact)
@@ -265,7 +283,7 @@ def proceed(grid, fleet, completion, profit, threshold, found, exact, n_steps):
             if profit[b] <= 0.0 or b == place:
                 continue
             length = length_so_far + fleet.distances[place, b]
-            if length + fleet.homeward[b] > fleet.limit[0]:
+            if length > fleet.limit[1] or length + fleet.homeward[b] > fleet.limit[0]:
                 continue
             position = fleet.position[place, b]
             if position >= 0 and (memory_so_far >> position) & 1:
@@ -273,20 +291,47 @@ def proceed(grid, fleet, completion, profit, threshold, found, exact, n_steps):
             total = profit_so_far + profit[b]
             if total + remaining(grid, fleet, completion, profit, b, length, 0) <= threshold:
                 continue
-            memory = 0
-            position = fleet.position[b, place]
-            if position >= 0:
-                memory |= 1 << position
-            rest = memory_so_far
-            a = 0
-            while rest:
-                if rest & 1:
-                    position = fleet.position[b, fleet.near[place, a]]
-                    if position >= 0:
-                        memory |= 1 << position
-                rest >>= 1
-                a += 1
+            memory = _passed_on(fleet, place, b, memory_so_far)
             if total + remaining(grid, fleet, completion, profit, b, length, memory) <= threshold:
                 continue
             _insert(fleet, found, b, length, total, memory, k, exact)
     return RUNNING
+
+
+@njit(cache=True, nogil=True)
+def join(fleet, labels, backward, first, best, front, back):
+    """
+    Join beginnings and ends of routes, where they cross half of the length.
+
+    :param labels: ``(n_labels,)`` of :data:`LABEL`, beginnings that nothing dominates
+    :param backward: ``(n_backward,)`` of :data:`LABEL`, ends, in the order of their places, those of a place by falling profit
+    :param first: ``(n + 1,)`` int64, where those of each place begin
+    :param best: ``(n,)``, what the best route is worth whose second half begins at each place, only above what it is before;
+        updated, as the next two
+    :param front: ``(n,)`` int64, its first half
+    :param back: ``(n,)`` int64, its second half
+    """
+    n_places = len(best)
+    for a in range(len(labels)):
+        label = labels[a]
+        place, profit, own_length = label.place, label.profit, label.length
+        memory = np.int64(label.memory)
+        for b in range(n_places):
+            if first[b] == first[b + 1] or b == place or profit + backward[first[b]].profit <= best[b]:
+                continue
+            length = own_length + fleet.distances[place, b]
+            if length <= fleet.limit[1] or length + fleet.homeward[b] > fleet.limit[0]:
+                continue
+            position = fleet.position[place, b]
+            if position >= 0 and (memory >> position) & 1:
+                continue
+            passed = _passed_on(fleet, place, b, memory)
+            for k in range(first[b], first[b + 1]):
+                other = backward[k]
+                if profit + other.profit <= best[b]:
+                    break
+                if length + other.length <= fleet.limit[0] and (passed & other.memory) == 0:
+                    best[b] = profit + other.profit
+                    front[b] = a
+                    back[b] = k
+                    break

@@ -35,6 +35,7 @@ class Kind:
     :param homeward: ``(n,)``, to the end
     :param limit: How far each flies
     :param grid: Their lengths, rounded down
+    :param backward: The same from the end to the start; the same object where that is one place
     """
 
     n_uavs: int
@@ -43,9 +44,15 @@ class Kind:
     homeward: np.ndarray
     limit: float
     grid: Grid
+    backward: Grid
 
-    def fleet(self, near: np.ndarray, position: np.ndarray) -> Fleet:
-        return Fleet(self.distances, self.outward, self.homeward, np.array([self.limit]), near, position)
+    def fleets(self, near: np.ndarray, position: np.ndarray) -> tuple[Fleet, Fleet]:
+        """:return: The data of the kernels, from the start to the end and from the end to the start"""
+        limit = np.array([self.limit, self.limit / 2])
+        forward = Fleet(self.distances, self.outward, self.homeward, limit, near, position)
+        if self.backward is self.grid:
+            return forward, forward
+        return forward, Fleet(self.distances, self.homeward, self.outward, limit, near, position)
 
 
 @dataclass(frozen=True)
@@ -96,7 +103,11 @@ class Places:
             limit = max(kind.limit * (1 + _MARGIN) + slack, _SHORTEST)
             n_uavs = min(len(kind.members), len(kept))
             outward, homeward = outward.ravel(), homeward.ravel()
-            kinds.append(Kind(n_uavs, between, outward, homeward, limit, _grid(between, homeward, limit)))
+            if kind.start == kind.end:
+                homeward = outward
+            grid = _grid(between, homeward, limit)
+            backward = grid if kind.start == kind.end else _grid(between, outward, limit)
+            kinds.append(Kind(n_uavs, between, outward, homeward, limit, grid, backward))
         return cls(values, tuple(kinds), place_of, tuple(frozenset(kind.members) for kind in reduced.kinds))
 
     @property
