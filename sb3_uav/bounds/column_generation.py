@@ -1,4 +1,4 @@
-"""Column generation: routes are found as they are needed, and the prices of places and UAVs bound what any schedule is worth."""
+"""Column generation: routes are found as they are needed, and prices of places and UAVs bound what any schedule is worth."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _SMOOTHING = 0.5
 _TOLERANCE = 1e-7
 # How many labels an exact search writes at first and at last, and a fast one.
 _FIRST_LABELS, _LAST_LABELS, _FAST_LABELS = 1_000_000, 4_000_000, 200_000
-# Where an exact search fails, its threshold is raised by this part of the way to what routes are worth at most, as far as that.
+# Where an exact search fails, its threshold is raised by this part of the way to what routes are worth at most; how far.
 _RISE, _HIGHEST = 0.15, 0.9
 # An exact search may take this part of the time that is left, a search for a first bound that one, which is due whenever only
 # this part of the time is left that was left after the last one.
-_EXACT_SHARE, _PROBE_SHARE, _PROBING = 0.5, 0.2, 0.6
+_EXACT_SHARE, _PROBE_SHARE, _PROBING = 0.5, 0.2, 0.75
 # How many exact searches with all the memory there is may fail.
 _MOST_FAILURES = 3
 # Of more routes than so many per place, those that are far from being taken are forgotten.
@@ -186,7 +186,10 @@ class ColumnGeneration:
         if len(self.master.routes) <= _MOST_ROUTES_PER_PLACE * (self._places.n + 10):
             return
         worth = np.array(
-            [self._values[list(route)].sum() - outer.places[list(route)].sum() - outer.uavs[k] for k, route in self.master.routes]
+            [
+                self._values[list(route)].sum() - outer.places[list(route)].sum() - outer.uavs[k]
+                for k, route in self.master.routes
+            ]
         )
         self.master.keep((worth >= np.median(worth)).tolist())
 

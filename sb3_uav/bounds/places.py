@@ -1,4 +1,4 @@
-"""What bounds need of an instance: places with values, and kinds of UAVs with their distances, a little longer than allowed."""
+"""What bounds need of an instance: places with values, and kinds of UAVs that fly a little farther than allowed."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from sb3_uav.bounds.places import Kind
 # Lengths of routes are sorted into so many buckets.
 _N_BUCKETS = 32
 # How many labels are continued between two looks at the clock.
-_CHUNK = 2000
+_CHUNK = 500
 # How many routes one search returns.
 _MOST_ROUTES = 60
 
@@ -125,7 +125,6 @@ class Pricing:
             found = self._memory.of(number, len(self._profits), n_labels)
             is_complete = direction.search(threshold, exact, found, is_late) and is_complete
             halves.append(found.labels[: int(found.state[0])])
-        self.last = [len(h) for h in halves]
         front, back = halves[0], halves[-1]
         routes = _whole_routes(front, threshold)
         if back is not front:

@@ -36,7 +36,7 @@ exit code:
 def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav bound",
-        description="Bound from above what any schedule of each instance can be worth. The bound is proven, however short the time.",
+        description="Bound from above what any schedule of each instance can be worth, with a proof, however short the time.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -112,7 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row, bound in tqdm(bounds, total=n_rows, unit="instance", disable=not sys.stderr.isatty(), leave=False):
         found[row] = bound
         with replaced_when_complete(args.out) as file:
-            write_csv(file, COLUMNS, ((row, f"{b.value:.12g}", f"{b.seconds:.3f}", b.status) for row, b in sorted(found.items())))
+            write_csv(
+                file, COLUMNS, ((row, f"{b.value:.12g}", f"{b.seconds:.3f}", b.status) for row, b in sorted(found.items()))
+            )
     n_optimal = sum(bound.status == "optimal" for bound in found.values())
     print(f"{args.out}: {len(found)} bounds, {n_optimal} of them reached by a schedule.")
     return 0
