@@ -188,6 +188,13 @@ def test_what_is_refused() -> None:
         upper_bound(instance, math.inf)
 
 
+def test_a_bound_below_a_schedule_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_uav.bounds.column_generation.ColumnGeneration.bound", 3.0)
+    instances = UniformGenerator(10, 2, 1.0)(1, np.random.default_rng(3))
+    with pytest.raises(AssertionError, match="above the bound of 3; please report"):
+        upper_bound(instances, 1.0)
+
+
 # ------------------------------------------------------------------------------------------------------------------- command
 
 

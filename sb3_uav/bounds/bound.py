@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from sb3_uav.bounds.column_generation import ColumnGeneration
@@ -102,11 +102,18 @@ def _bound_one(instance: Instances, time_limit: float, incumbent: Schedule | Non
             value = min(value, rounded(columns.bound))
         is_finished = columns.is_finished
     status = OPTIMAL if is_met(value) else BOUND if is_finished else TIME_LIMIT
+    if best > value * (1 + 2 * _ROUNDING):
+        raise AssertionError(f"A schedule is worth {best:g}, above the bound of {value:g}; please report this error.")
     return Bound(max(value, best), clock() - start, status, best)
 
 
-def _first_schedules(instance: Instances, incumbent: Schedule | None, seconds: float):  # type: ignore[no-untyped-def]
-    """Schedules by local search."""
+def _first_schedules(instance: Instances, incumbent: Schedule | None, seconds: float) -> Iterator[Schedule]:
+    """
+    :param instance: A batch of one
+    :param incumbent: A schedule that is known
+    :param seconds: How long each search may take
+    :return: Schedules by local search
+    """
     search = LocalSearch(instance)
     yield (first := search.repair(search.insertion(), seconds))
     for seed in range(_N_SEARCHES):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -41,6 +42,7 @@ class ColumnGeneration:
 
     :param places: At least one place
     :param is_late: Says when to stop
+    :param seconds_left: Says how long that is from now
     :ivar bound: Total value of the best schedule at most, in the unit of the values
     :ivar is_finished: Whether more time changes nothing
     """
@@ -121,11 +123,11 @@ class ColumnGeneration:
         profits = np.maximum(self._values - prices.places, 0.0)
         profits[profits < _TOLERANCE] = 0.0
         used = self._values - profits
-        kinds = []
-        for kind in self._places.kinds:
+        kinds: list[Pricing] = []
+        for own in self._places.kinds:
             if self._is_late():
                 return False
-            kinds.append(Pricing(kind, *kind.fleets(self._near, self._position), profits, self._memory))
+            kinds.append(Pricing(own, *own.fleets(self._near, self._position), profits, self._memory))
         self._accept(used, np.array([kind.most for kind in kinds]))
         thresholds = prices.uavs + _TOLERANCE
         n_new = 0
@@ -145,6 +147,9 @@ class ColumnGeneration:
         self._accept(used, most)
         return n_new > 0
 
+    def _has_less_than(self, seconds: float) -> bool:
+        return self._seconds_left() < seconds
+
     def _exact(self, number: int, kind: Pricing, threshold: float, seconds: float) -> tuple[list[list[int]], float]:
         """
         Look for routes that are worth more than a threshold; if there are too many labels, than a higher one.
@@ -162,7 +167,7 @@ class ColumnGeneration:
                 threshold + height * (kind.most - threshold),
                 True,
                 int(self._n_labels[number]),
-                lambda end=end: self._seconds_left() < end,
+                partial(self._has_less_than, end),
             )
             if found.is_complete or found.routes:
                 return found.routes, found.most

@@ -97,12 +97,15 @@ class Places:
         kinds = []
         for kind in reduced.kinds:
             between, outward, homeward = (
-                np.ascontiguousarray(reduced.distances[np.ix_(rows, columns)])
-                for rows, columns in ((nodes, nodes), ([kind.start], nodes), (nodes, [kind.end]))
+                np.ascontiguousarray(part)
+                for part in (
+                    reduced.distances[np.ix_(nodes, nodes)],
+                    reduced.distances[kind.start, nodes],
+                    reduced.distances[nodes, kind.end],
+                )
             )
             limit = max(kind.limit * (1 + _MARGIN) + slack, _SHORTEST)
             n_uavs = min(len(kind.members), len(kept))
-            outward, homeward = outward.ravel(), homeward.ravel()
             if kind.start == kind.end:
                 homeward = outward
             grid = _grid(between, homeward, limit)
