@@ -17,6 +17,7 @@ ROOMS = (
     "envs",
     "registration",
     "local_search",
+    "bounds",
     "policies",
     "reinforce",
     "pretrained",
