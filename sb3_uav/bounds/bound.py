@@ -27,8 +27,8 @@ class Bound:
     """
     :param value: No schedule has a larger total value
     :param seconds: How long that took
-    :param status: ``"optimal"`` if a schedule of this value is known; ``"time limit"`` if more time might lower it; else
-        ``"bound"``
+    :param status: ``"optimal"`` if a schedule of this value is known and no task must be served; ``"time limit"`` if more
+        time might lower it; else ``"bound"``
     :param best: The largest total value of a schedule that is known
     """
 
@@ -101,7 +101,9 @@ def _bound_one(instance: Instances, time_limit: float, incumbent: Schedule | Non
             columns.step(best)
             value = min(value, rounded(columns.bound))
         is_finished = columns.is_finished
-    status = OPTIMAL if is_met(value) else BOUND if is_finished else TIME_LIMIT
+    # A schedule of the same total value may leave out what must be served.
+    is_all = instance.must_serve is None or not bool(instance.must_serve.any())
+    status = OPTIMAL if is_met(value) and is_all else BOUND if is_finished or is_met(value) else TIME_LIMIT
     if best > value * (1 + 2 * _ROUNDING):
         raise AssertionError(f"A schedule is worth {best:g}, above the bound of {value:g}; please report this error.")
     return Bound(max(value, best), clock() - start, status, best)

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_uav.common.checked_zip import MIB, CheckedZip, ZipDamageError
-from sb3_uav.common.plain_json import read_plain_json
+from sb3_uav.common.json_text import read_plain_json
 from sb3_uav.common.tensor_file import MAX_TENSOR_BYTES, read_tensor_file
 from sb3_uav.policies.allocator import AllocatorPolicy
 from sb3_uav.policies.base import EpisodicPolicy

@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.epoch_log import EpochRecord
 from sb3_uav.common.files import file_hash, write_atomically
-from sb3_uav.common.plain_json import read_plain_json
+from sb3_uav.common.json_text import read_plain_json
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import n_updates
 from sb3_uav.envs.generators import InstanceGenerator

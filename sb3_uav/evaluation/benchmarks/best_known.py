@@ -44,7 +44,9 @@ def read_best_known(path: Path) -> dict[str, float]:
         if value < 0:
             raise ValueError(f"{where}: best_known of {name!r:.80} is {text}; it must be at least 0.")
         if values.setdefault(name, value) != value:
-            raise ValueError(f"{where}: best_known of {name!r:.80} is {text}, but {values[name]:g} in a line before; keep one.")
+            raise ValueError(
+                f"{where}: best_known of {name!r:.80} is {text}, but {values[name]:g} in a line before; keep one."
+            )
     if not values:
         raise ValueError(f"{path}: holds no best-known value; add a line for every instance.")
     return values
