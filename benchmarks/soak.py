@@ -6,10 +6,11 @@ Random kills and restarts: what comes out at the end must equal what comes out o
 Two commands are killed again and again: ``sb3-uav train`` of a tiny pair (warm start, both levels by ITSCallback, checkpoints,
 FixedSetEvalCallback), and ``sb3-uav evaluate``. A kill is SIGKILL before the k-th file operation, or shortly after it, in the
 middle of a write, or after a random time. Then the command is run again as a user would: ``train`` with ``-i`` of the newest
-checkpoint, or unchanged where there is none; ``evaluate`` unchanged. Once a command has ended by itself, its files are compared
-with those of an unbroken run, but for seconds: parameters and optimizers of the final and best zips, histories of evaluations,
-logs, results, schedules and summaries. Each process is forked from one that has imported everything. Ends with 1 if anything
-differs; the folders of those chains are kept.
+checkpoint, or unchanged where there is none; ``evaluate`` unchanged.
+
+Once a command has ended by itself, its files are compared with those of an unbroken run, but for seconds: parameters and
+optimizers of the final and best zips, histories of evaluations, logs, results, schedules and summaries. Each process is forked
+from one that has imported everything. Ends with 1 if anything differs; the folders of those chains are kept.
 """
 
 from __future__ import annotations
@@ -140,7 +141,6 @@ def run_forked(run: Callable[[Path], int], folder: Path, kill: Kill | None = Non
             os.dup2(log.fileno(), 1)
             os.dup2(log.fileno(), 2)
             sys.stdout = sys.stderr = log
-            # Not to be read back by the parent's hook.
             _announce(folder, kill, sending)
             code = run(folder)
         except BaseException:
@@ -157,8 +157,8 @@ def run_forked(run: Callable[[Path], int], folder: Path, kill: Kill | None = Non
         operations = lines.read().splitlines()
     _, status = os.waitpid(child, 0)
     timer.cancel()
-    code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
-    return Outcome(code, len(operations), operations[-1] if operations else "none", time.perf_counter() - began)
+    ended = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
+    return Outcome(ended, len(operations), operations[-1] if operations else "none", time.perf_counter() - began)
 
 
 def _training_config() -> dict[str, Any]:
@@ -203,14 +203,16 @@ def training_scene(inputs: Path) -> Scene:
 
     def read(folder: Path) -> dict[str, Any]:
         last = _run_folders(folder)[0]
+        # A run that is continued after its last epoch leaves them where they are.
+        log = next(path for path in _run_folders(folder) if (path / "its_log.csv").is_file())
         zips = [last / f"{ENV}.zip", last / "router.zip", last / "best_model.zip", last / "best_router.zip"]
         with np.load(last / "evaluations.npz") as arrays:
             history = {name: arrays[name].tolist() for name in arrays.files if name not in _SECONDS}
         return {
             **{f"{path.name} {name}": value for path in zips for name, value in _tensors(path).items()},
             "evaluations.npz": history,
-            "its_log.csv": _rows(last / "its_log.csv"),
-            "checkpoint": json.loads((last / CHECKPOINT_FOLDER / "its_state.json").read_text())["epoch"],
+            "its_log.csv": _rows(log / "its_log.csv"),
+            "checkpoint": json.loads((log / CHECKPOINT_FOLDER / "its_state.json").read_text())["epoch"],
             "leftovers": sorted(path.name for path in last.rglob("*.tmp*")),
         }
 
