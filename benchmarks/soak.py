@@ -32,6 +32,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -350,6 +351,12 @@ def soak(n_kills: int, seed: int, folder: Path, scenes: Sequence[str] = ("train"
     :return: What has happened
     """
     folder = folder.resolve()
+    th.set_num_threads(1)
+    experiment.register_algorithms()
+    # What would be imported later; optimizers import half of torch, which takes seconds.
+    for module in ("sb3_uav.training.imitation", "sb3_uav.evaluation.run", "sb3_uav.zoo.trust"):
+        import_module(module)
+    th.optim.Adam([th.nn.Parameter(th.zeros(1))])
     makers = {"train": training_scene, "evaluate": evaluation_scene}
     tally = Tally()
     prepared = []
@@ -384,8 +391,6 @@ def main() -> int:
     parser.add_argument("--scenes", nargs="+", choices=("train", "evaluate"), default=["train", "evaluate"])
     parser.add_argument("--out", type=Path, help="an empty folder (default: a temporary one)")
     arguments = parser.parse_args()
-    th.set_num_threads(1)
-    experiment.register_algorithms()
     folder = Path(tempfile.mkdtemp(prefix="soak_")) if arguments.out is None else arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     began, usage = time.perf_counter(), os.times()

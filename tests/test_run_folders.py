@@ -131,7 +131,7 @@ def test_a_vanished_checkpoint_folder_is_not_made_again(tmp_path: Path) -> None:
         callback_save()
         shutil.rmtree(tmp_path / "run")
 
-    callback._save_checkpoint = vanish  # type: ignore[method-assign]
+    callback._save_checkpoint = vanish
     with pytest.raises(FileNotFoundError, match="folder of the checkpoints has vanished"):
         learn(allocator, callback)
     assert not (tmp_path / "run" / "its_checkpoint").exists()
