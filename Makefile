@@ -10,13 +10,13 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP_CONSTRAINTS := $(addprefix -c ,$(CONSTRAINTS))
 LINT_PATHS := sb3_uav tests benchmarks examples scripts docs
-# Some are about results, not speed: they take arguments and an hour.
-NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py)
+# Some are about results, not speed: they take arguments and an hour, or have a target of their own.
+NEED_ARGUMENTS := $(addprefix benchmarks/,ablation.py better_than_the_paper.py learned_start.py router_gap.py soak.py)
 BENCHMARKS := $(filter-out benchmarks/_% $(NEED_ARGUMENTS),$(sort $(wildcard benchmarks/*.py)))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: install demo docs notebooks test test-fast lint format check-codestyle type commit-checks bench clean help
+.PHONY: install demo docs notebooks test test-fast lint format check-codestyle type commit-checks bench soak clean help
 
 install: $(INSTALLED)  ## Create .venv and install the package, its extras and the development tools
 
@@ -62,6 +62,9 @@ commit-checks: format lint type  ## What to run before a commit
 
 bench: $(INSTALLED)  ## Run every benchmark
 	@set -e; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script; done
+
+soak: $(INSTALLED)  ## Kill trainings and evaluations 200 times at random, and compare what comes out with unbroken runs
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/soak.py --kills 200 --seed 1
 
 clean:  ## Remove caches, builds and the demo's files (not .venv, not logs)
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -17,7 +17,7 @@ LOG_FILE = "its_log.csv"
 
 class Moment(NamedTuple):
     """
-    :param wall: Wall time in seconds
+    :param wall: Seconds of a clock that is never set
     :param cpu: CPU time of the process in seconds, of all its threads
     """
 
@@ -27,7 +27,7 @@ class Moment(NamedTuple):
     @classmethod
     def now(cls) -> Moment:
         """:return: The present"""
-        return cls(time.time(), time.process_time())
+        return cls(time.perf_counter(), time.process_time())
 
     def since(self) -> Moment:
         """:return: The times that have passed since this moment, rounded to milliseconds"""

@@ -5,10 +5,18 @@ from __future__ import annotations
 import csv
 import hashlib
 import os
+import re
+import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
+
+if sys.platform != "win32":
+    import fcntl
+
+# Those of :func:`temporary_name`: a name, and its suffix once more.
+_TEMPORARY = re.compile(r".+(\.\w+)\.tmp\1")
 
 
 @contextmanager
@@ -23,10 +31,68 @@ def temporary_name(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.name}.tmp{path.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with _held(temporary):
+            yield temporary
+            os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        # Such as that of a full disk.
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _held(temporary: Path) -> Iterator[None]:
+    """Lock a temporary file as long as the ``with`` block or the process lasts; where there are no locks, do nothing."""
+    if sys.platform == "win32":
+        # Nobody can remove a file there while it is open.
+        yield
+        return
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
+    try:
+        _lock(descriptor)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """:return: Whether no other process has locked the file, as far as is known"""
+    if sys.platform != "win32":
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            # Some network file systems have no locks.
+            pass
+    return True
+
+
+def remove_leftovers(folder: Path) -> None:
+    """
+    Remove the temporary files of processes that were killed while they wrote them. Those that a process is writing stay.
+
+    :param folder: A folder, which may be missing
+    """
+    try:
+        found = [path for path in folder.iterdir() if _TEMPORARY.fullmatch(path.name)]
+    except OSError:
+        return
+    for path in found:
+        # Where the folder is read-only, or another process is faster, they do no harm.
+        with suppress(OSError):
+            descriptor = os.open(path, os.O_WRONLY)
+            try:
+                is_left = _lock(descriptor)
+                if is_left and sys.platform != "win32":
+                    path.unlink()
+            finally:
+                os.close(descriptor)
+            if is_left and sys.platform == "win32":
+                path.unlink()
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

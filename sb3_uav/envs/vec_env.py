@@ -99,7 +99,7 @@ class BatchedVecEnv(VecEnv):
         # Instance and routes of the episodes that ended in the last step, for rendering.
         self._ended: dict[int, tuple[Instances, list[list[int]]]] = {}
         self.episodes = Episodes(self.problem, len(env_fns))
-        self._start_time = time.time()
+        self._start_time = time.perf_counter()
         self._actions = np.zeros(len(env_fns), dtype=np.int64)
         super().__init__(len(env_fns), problem_env.observation_space, problem_env.action_space)
         self._episode_returns = np.zeros(self.num_envs)
@@ -158,7 +158,7 @@ class BatchedVecEnv(VecEnv):
 
     def episode_info(self, episode_return: float, length: int) -> dict[str, float]:
         """Episode statistics in the form of SB3's ``Monitor``."""
-        elapsed = round(time.time() - self._start_time, 6)
+        elapsed = round(time.perf_counter() - self._start_time, 6)
         return {"r": round(float(episode_return), 6), "l": int(length), "t": elapsed}
 
     def log_episode(self, episode_info: dict[str, float]) -> None:

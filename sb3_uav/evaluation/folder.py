@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.common.files import remove_leftovers, replaced_when_complete
 from sb3_uav.common.json_text import parse_json
 from sb3_uav.evaluation.instance_sets import InstanceSet
 from sb3_uav.evaluation.provenance import describe_machine, describe_solver
@@ -62,6 +62,7 @@ class EvaluationFolder:
         shard: Shard = Shard(),  # noqa: B008 (a tuple)
     ) -> None:
         self.folder = folder
+        remove_leftovers(folder)
         self.changed_versions: list[str] = []
         settings: dict[str, Any] = {
             "format": FORMAT,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import warnings
@@ -14,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_uav.common.divergence import note_saved, require_finite_model
 from sb3_uav.common.epoch_log import EpochRecord
-from sb3_uav.common.files import file_hash, write_atomically
+from sb3_uav.common.files import file_hash, remove_leftovers, write_atomically
 from sb3_uav.common.json_text import read_plain_json
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.common.sb3_compat import n_updates
@@ -57,8 +58,10 @@ def write_checkpoint(
     :param origin: What the run started from, see :func:`origin_of`
     :param keep: Number of checkpoints to keep, this one included
     :raises DivergenceError: If a number in either model is not finite; the earlier checkpoint is then untouched
-    :raises OSError: If a file cannot be written
+    :raises OSError: If a file cannot be written, or the folder has vanished since the last checkpoint
     """
+    _require_folder(folder, allocator)
+    remove_leftovers(folder)
     for model in (allocator, router):
         require_finite_model(model, folder)
     # The allocator may have finished more epochs than the strategy has, because one batch can hold several.
@@ -77,6 +80,14 @@ def write_checkpoint(
     for model in (allocator, router):
         note_saved(model, folder / names["allocator"], is_checkpoint=True)
     remove_old(folder, keep)
+
+
+def _require_folder(folder: Path, allocator: BaseAlgorithm) -> None:
+    """:raises FileNotFoundError: If the allocator has a checkpoint in this folder, which has vanished"""
+    noted = getattr(allocator, CHECKPOINT, None)
+    if isinstance(noted, dict) and noted.get("folder") == str(folder.resolve()) and not folder.is_dir():
+        message = "the folder of the checkpoints has vanished during the training, which stops; start it again"
+        raise FileNotFoundError(errno.ENOENT, message, str(folder))
 
 
 def n_router_epochs(records: Sequence[EpochRecord]) -> int:
@@ -240,6 +251,7 @@ def find_state(folder: Path, allocator: BaseAlgorithm) -> dict[str, Any]:
     :raises FileNotFoundError: If there is none
     :raises ValueError: If a state file is damaged, or the allocator belongs to none of them
     """
+    remove_leftovers(folder)
     state = read_state(folder)
     epoch = _epoch_of(allocator, state["epoch"])
     # A new allocator is at epoch 0, but belongs to no checkpoint.

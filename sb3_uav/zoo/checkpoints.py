@@ -10,11 +10,12 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 
 from sb3_uav.common.callback_tree import siblings
 from sb3_uav.common.divergence import note_saved, require_finite_model
+from sb3_uav.common.files import remove_leftovers
 from sb3_uav.common.saving import save_atomically
 from sb3_uav.training.arguments import check_counts
 from sb3_uav.training.best_pair import BEST_MODEL_FILE, RouterCallback, find_best_router
 from sb3_uav.training.its import ROUTER_FILE
-from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, read_state, router_of
+from sb3_uav.training.its_checkpoint import CHECKPOINT_FOLDER, STATE_FILE, WARM_START_FOLDER, read_state, router_of
 from sb3_uav.training.kept_checkpoints import oldest
 
 _MODEL_FILE = re.compile(r"rl_model_(\d+)_steps\.zip")
@@ -89,6 +90,17 @@ def newest_checkpoint(folder: Path) -> Path | None:
         numbered = {_MODEL_FILE.fullmatch(path.name): path for path in folder.glob("rl_model_*_steps.zip")}
         steps = {int(match.group(1)): path for match, path in numbered.items() if match is not None}
         return steps[max(steps)] if steps else None
+
+
+def remove_leftovers_of(trained_agent: Path) -> None:
+    """
+    Remove what the run to which a zip belongs had not written to the end when it was killed.
+
+    :param trained_agent: The zip
+    """
+    folder = trained_agent.parent.parent if trained_agent.parent.name == CHECKPOINT_FOLDER else trained_agent.parent
+    for one in (folder, folder / CHECKPOINT_FOLDER, folder / CHECKPOINT_FOLDER / WARM_START_FOLDER):
+        remove_leftovers(one)
 
 
 def find_router(allocator: Path) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
@@ -25,11 +26,12 @@ from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.finite import watch
 from sb3_uav.reinforce.transfer import load
 from sb3_uav.training import FixedSetEvalCallback, ITSCallback, StopAtDivergence
-from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint, newest_checkpoint
+from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint, newest_checkpoint, remove_leftovers_of
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
+from sb3_uav.zoo.run_folders import RunFolderGuard, make_run_folder, require_folder
 from sb3_uav.zoo.shared_study import SeedPerTrial, fail_trials_of_dead_workers, note_worker, shared_studies
 from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
 
@@ -172,6 +174,7 @@ class UAVExperimentManager(ExperimentManager):
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         require_finite_model(model, self.save_path)
         if distributed.is_main():
+            require_folder(Path(self.params_path))
             super().save_trained_model(model)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
@@ -244,6 +247,11 @@ class UAVExperimentManager(ExperimentManager):
         self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_log_folder(self) -> str:
+        if self.continue_training:
+            remove_leftovers_of(Path(self.trained_agent))
+        # As rl_zoo3 writes it, whose numbers two runs can get at the same moment.
+        self.save_path = os.path.join(self.log_path, make_run_folder(Path(self.save_path)).name)
+        self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
         return self.save_path
 
@@ -256,6 +264,8 @@ class UAVExperimentManager(ExperimentManager):
         # Before what saves files, but not in the place of the progress bar, whose end rl_zoo3 calls.
         saves = bool(self.callbacks) and isinstance(self.callbacks[0], EventCallback | CheckpointCallback)
         self.callbacks.insert(0 if saves else 1, StopAtDivergence())
+        if distributed.is_main():
+            self.callbacks.insert(0 if saves else 1, RunFolderGuard(Path(self.params_path)))
         self.callbacks = [
             PairCheckpointCallback.of(callback) if type(callback) is CheckpointCallback else callback
             for callback in self.callbacks

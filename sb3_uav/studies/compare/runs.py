@@ -124,11 +124,11 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
                     training = waiting.pop(0)
                     number = len(trainings) - len(waiting)
                     print(f"[{number}/{len(trainings)}] {training.name}, seed {training.seed}", flush=True)
-                    running.append((training, training.start(), time.time()))
+                    running.append((training, training.start(), time.perf_counter()))
                 for job in [job for job in running if job[1].poll() is not None]:
                     running.remove(job)
                     training, process, began = job
-                    failure = training.finish(process.returncode, time.time() - began)
+                    failure = training.finish(process.returncode, time.perf_counter() - began)
                     failures += [] if failure is None else [failure]
                 time.sleep(0.1)
         finally:
