@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sb3_uav.common.files import remove_leftovers, replaced_when_complete, temporary_name, write_atomically
@@ -135,3 +136,24 @@ def test_a_vanished_checkpoint_folder_is_not_made_again(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="folder of the checkpoints has vanished"):
         learn(allocator, callback)
     assert not (tmp_path / "run" / "its_checkpoint").exists()
+
+
+def test_a_vanished_folder_of_an_evaluation_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sb3_uav.cli.main import main
+    from sb3_uav.envs import UniformGenerator
+    from sb3_uav.evaluation.folder import EvaluationFolder
+
+    UniformGenerator(n_tasks=8, n_uavs=2)(3, np.random.default_rng(1)).save(tmp_path / "instances.npz")
+    original = EvaluationFolder.add
+
+    def vanish(folder: EvaluationFolder, *arguments: Any) -> None:
+        original(folder, *arguments)
+        shutil.rmtree(folder.folder, ignore_errors=True)
+
+    monkeypatch.setattr(EvaluationFolder, "add", vanish)
+    words = ["--instances", str(tmp_path / "instances.npz"), "--solvers", "kmeans-nearest", "--out", str(tmp_path / "out")]
+    assert main(["evaluate", *words]) == 2
+    assert str(tmp_path / "out" / "results.csv") in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
