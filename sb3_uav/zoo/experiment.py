@@ -167,6 +167,11 @@ class UAVExperimentManager(ExperimentManager):
             if str(self.config) in str(error):
                 raise
             raise ValueError(f"{self._where}: {error}") from error
+        except FileNotFoundError as error:
+            # A file that the YAML names; the system's own errors have a number.
+            if error.errno is not None or str(self.config) in str(error):
+                raise
+            raise FileNotFoundError(f"{self._where}: {error}") from error
         if noted.interruption is not None:
             checkpoint = newest_checkpoint(Path(self.save_path))
             raise Interruption((), () if checkpoint is None else ("-i", str(checkpoint))) from noted.interruption
