@@ -9,6 +9,8 @@ from typing import IO
 
 import numpy as np
 
+from sb3_uav.common.regular_file import open_regular
+
 # Upper bound of the compression ratio of deflate, which np.savez_compressed uses (https://zlib.net/zlib_tech.html).
 _GREATEST_COMPRESSION = 1032
 _SUFFIX = ".npy"
@@ -28,7 +30,7 @@ def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
     :raises ValueError: If it is not an intact ``.npz``, or holds anything but plain arrays
     """
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); {advice}.") from error
     with stream:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.regular_file import open_regular
 
 RESULTS_FILE = "results.csv"
 SCHEDULES_FILE = "schedules.jsonl"
@@ -94,6 +95,8 @@ _OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "boun
 
 # Whole numbers but seeds are below, so that the arrays of summaries hold them.
 _MAX_WHOLE_NUMBER = 2**31
+# A schedule of a million tasks takes 8 MB.
+_MAX_LINE = 16 * 2**20
 
 
 def one_line(text: object) -> str:
@@ -167,10 +170,16 @@ def whole_lines(path: Path) -> Iterator[Line]:
     :return: Its lines, except for a last one without a line break
     :raises ValueError: If it is not a text file
     """
-    offset = 0
-    with path.open("rb") as file:
+    offset = number = 0
+    with open_regular(path) as file:
         # In binary, where only line feeds end lines: other line breaks may be part of a name.
-        for number, content in enumerate(file, start=1):
+        while content := file.readline(_MAX_LINE + 1):
+            number += 1
+            if len(content) > _MAX_LINE:
+                raise ValueError(
+                    f"{path}: is damaged (line {number} has more than the {_MAX_LINE} bytes that are read); "
+                    "start over with --overwrite."
+                )
             if not content.endswith(b"\n"):
                 return
             try:
