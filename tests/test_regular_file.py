@@ -77,7 +77,14 @@ def test_shards_of_strangers(tmp_path: Path) -> None:
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_an_evaluation_goes_on_from_no_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     UniformGenerator(5, n_uavs=2)(1, np.random.default_rng(0)).save(tmp_path / "x.npz")
-    os.mkfifo(tmp_path / "results.csv")
     arguments = ["evaluate", "--instances", str(tmp_path / "x.npz"), "--solvers", "kmeans-nearest", "--out", str(tmp_path)]
-    assert main(arguments) == 2
-    assert "results.csv: this is no regular file" in capsys.readouterr().err
+    assert main(arguments) == 0
+    for name in ("results.csv", "schedules.jsonl", "evaluation.json"):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).unlink()
+        os.mkfifo(tmp_path / name)
+        assert main(arguments) == 2
+        assert f"{name}: this is no regular file" in capsys.readouterr().err
+        (tmp_path / name).unlink()
+        (tmp_path / name).write_bytes(content)
+    assert main(arguments) == 0

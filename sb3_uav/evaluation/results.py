@@ -240,7 +240,7 @@ def iterate_schedules(path: Path) -> Iterator[tuple[Line, ResultKey]]:
     :return: Its lines, one after the other, with the results that they belong to
     :raises ValueError: If it was damaged
     """
-    if not path.is_file():
+    if not path.exists():
         return
     for line in whole_lines(path):
         try:
