@@ -88,7 +88,6 @@ RESULT_COLUMNS = tuple(field.name for field in fields(ResultRow))
 # Of earlier versions, whose results are read and resumed as well.
 _EARLIER_COLUMNS = tuple(name for name in RESULT_COLUMNS if name != "unserved")
 _WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size", "unserved"}
-_COUNTS = _WHOLE_NUMBERS - {"seed"}
 _NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
 _OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound", "unserved"}
 
@@ -212,10 +211,9 @@ def parse_result(columns: Sequence[str], text: str) -> ResultRow:
             values[name] = None
         else:
             values[name] = int(values[name]) if name in _WHOLE_NUMBERS else float(values[name])
-        if name in _COUNTS and values[name] is not None and not 0 <= values[name] < 2**31:
-            raise ValueError(f"{name} is {values[name]}")
-            if not (math.isfinite(values[name]) if name in _NUMBERS else name == "seed" or values[name] < _MAX_WHOLE_NUMBER):
-                raise ValueError(f"{name} is {values[name]}")
+            is_within = math.isfinite(values[name]) if name in _NUMBERS else 0 <= values[name] < _MAX_WHOLE_NUMBER
+            if name != "seed" and not is_within:
+                raise ValueError(f"{name} is {values[name]}{', below 0' if values[name] < 0 else ''}")
     if values["feasible"] not in ("True", "False") or values["status"] not in (OK, INFEASIBLE, FAILED):
         raise ValueError(f"feasible is {values['feasible']!r} and status is {values['status']!r}")
     values["feasible"] = values["feasible"] == "True"
