@@ -44,6 +44,10 @@ def _laughs(merge: bool, levels: int = 30) -> str:
         "- 1",
         "",
         "a: " + "x" * 2**20,
+        "[" + "1," * 2**16 + "]",
+        "a: " + "1:" * 2**16 + "1",
+        "a: " + "1:" * 2**16 + "1.0",
+        "a: 0x" + "f" * 200,
     ],
 )
 def test_hostile_yaml_is_refused_with_its_name(tmp_path: Path, read: Any, text: str) -> None:

@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 import warnings
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from instance_helpers import arrays
+from malicious_zips import million_members
 
 from sb3_uav.common.npz import read_npz
 from sb3_uav.envs import Instances
@@ -149,3 +151,39 @@ def test_any_damage_to_a_header_is_a_value_error(position: float, flips: bytes, 
             Instances.load(path)
         except ValueError as error:
             assert str(error).startswith(f"{path}: ")
+
+
+def nested(n_members: int, size: int) -> bytes:
+    """An archive of arrays that lie in each other: the numbers of each are all members after it."""
+
+    def header(n: int) -> bytes:
+        return npy(f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({n},), }}".ljust(117))
+
+    content, entries = header(size) + bytes(size), []
+    for number in reversed(range(n_members)):
+        name = b"%04d.npy" % number
+        fields = struct.pack("<5H3I2H", 20, 0, 0, 0, 33, zlib.crc32(content), len(content), len(content), len(name), 0)
+        entries.insert(0, (name, fields))
+        whole = b"PK\3\4" + fields + name + content
+        content = header(len(whole)) + whole
+    # From each member to the next: the record of 30 bytes, its name, and the header of the array.
+    places = range(0, n_members * (30 + 8 + 128), 30 + 8 + 128)
+    table = b"".join(
+        b"PK\1\2" + struct.pack("<H", 20) + fields + struct.pack("<3H2I", 0, 0, 0, 0, at) + name
+        for at, (name, fields) in zip(places, entries, strict=True)
+    )
+    return whole + table + b"PK\5\6" + struct.pack("<4H2IH", 0, 0, n_members, n_members, len(table), len(whole), 0)
+
+
+def test_members_that_lie_in_each_other(tmp_path: Path) -> None:
+    path = tmp_path / "nested.npz"
+    path.write_bytes(nested(2, 10))
+    assert [len(array) for array in read_npz(path, "write it again").values()] == [176, 10]
+    path.write_bytes(nested(200, 2**20))
+    with pytest.raises(ValueError, match=r"nested\.npz: .* bytes would become \d{9} bytes"):
+        read_npz(path, "write it again")
+
+
+def test_a_million_members(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="more than 20000 members"):
+        read_npz(million_members(tmp_path / "many.npz"), "write it again")

@@ -139,6 +139,7 @@ def test_states_that_were_tampered_with(good: Path, tmp_path: Path) -> None:
     group = optimizer["param_groups"][0]
     moments = {"step": th.tensor(1.0), "exp_avg": th.zeros(3, 4, 5, 6)}
     system = torch_zip(pickle.dumps(Touch(proof), 2), {})
+    last = optimizer["state"][max(optimizer["state"])]
     for name, content in {
         "policy.optimizer.pth": system,
         "pytorch_variables.pth": system,
@@ -149,7 +150,15 @@ def test_states_that_were_tampered_with(good: Path, tmp_path: Path) -> None:
         "policy.optimizer.pth 4": saved([optimizer]),
         "policy.optimizer.pth 5": saved({**optimizer, "state": {0: {"step": th.tensor(float("inf"))}}}),
         "policy.optimizer.pth 6": saved({**optimizer, "state": {0: 3}}),
+        "policy.optimizer.pth 7": saved({**optimizer, "param_groups": []}),
+        "policy.optimizer.pth 8": saved({**optimizer, "param_groups": [{**group, "params": 3}]}),
+        "policy.optimizer.pth 9": saved({**optimizer, "param_groups": [{**group, "lr": 10**400}]}),
+        "policy.optimizer.pth 10": saved({**optimizer, "param_groups": [{**group, "betas": 5}]}),
+        "policy.optimizer.pth 11": saved({**optimizer, "param_groups": [{**group, "capturable": True}]}),
+        "policy.optimizer.pth 12": saved({**optimizer, "state": {10**6: {}}}),
+        "policy.optimizer.pth 13": saved({**optimizer, "state": {n: last for n in optimizer["state"]}}),
         "pytorch_variables.pth 1": saved({"a": th.zeros(1)}),
+        "pytorch_variables.pth 2": saved(th.zeros(2)),
         "baseline_policy.pth 1": saved({"a": th.zeros(1)}),
     }.items():
         member = name.split()[0]

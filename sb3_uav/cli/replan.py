@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import fields
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_uav.cli.solve import add_flight_options, flight_of
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.common.optional import require
 from sb3_uav.missions.flight import FlightOptions
 
@@ -80,7 +80,7 @@ def _former_flight(folder: Path) -> dict[str, Any]:
     from sb3_uav.missions.writers.summary import SUMMARY_FILE
 
     try:
-        flight = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))["flight"]
+        flight = read_json_file(folder / SUMMARY_FILE)["flight"]
         known = {field.name: flight[field.name] for field in fields(FlightOptions)}
         FlightOptions(**known)
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

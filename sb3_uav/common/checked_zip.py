@@ -9,7 +9,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 MIB = 2**20
 # Of the largest file that is looked at. The default networks take 3 MB with their optimizer, the paper's 8 MB.
@@ -51,8 +51,10 @@ class CheckedZip:
     ) -> None:
         self._stream: BinaryIO = io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
         try:
-            _check_number(self._stream)
-            self._stream.seek(0)
+            size = self._stream.seek(0, os.SEEK_END)
+            if size > MAX_FILE:
+                raise ZipDamageError(f"it has {size} bytes, more than the {MAX_FILE} that are read")
+            check_number(self._stream)
             try:
                 self._archive = zipfile.ZipFile(self._stream)
             except DAMAGE as error:
@@ -106,17 +108,14 @@ class CheckedZip:
             raise ZipDamageError(f"member {name!r:.80} has {done} bytes in place of {len(target)}")
 
 
-def _check_number(stream: BinaryIO) -> None:
+def check_number(stream: IO[bytes]) -> None:
     """
     Count the entries of all tables of contents, before zipfile makes an object of each.
 
-    :param stream: A file
-    :raises ZipDamageError: If there are too many, or the file is too large
+    :param stream: A file, of which the last 512 MiB are looked at; it is at its beginning afterwards
+    :raises ZipDamageError: If there are too many
     """
-    size = stream.seek(0, os.SEEK_END)
-    if size > MAX_FILE:
-        raise ZipDamageError(f"it has {size} bytes, more than the {MAX_FILE} that are read")
-    stream.seek(0)
+    stream.seek(max(0, stream.seek(0, os.SEEK_END) - MAX_FILE))
     found, tail = 0, b""
     while piece := stream.read(MIB):
         found += (tail + piece).count(_SIGNATURE)
@@ -124,6 +123,7 @@ def _check_number(stream: BinaryIO) -> None:
         tail = piece[-(len(_SIGNATURE) - 1) :]
         if found > MAX_MEMBERS:
             raise ZipDamageError(f"it has more than {MAX_MEMBERS} members")
+    stream.seek(0)
 
 
 def _checked_members(

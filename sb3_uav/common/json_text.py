@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
+
+from sb3_uav.common.regular_file import MAX_TEXT, read_regular
 
 # Values of one text, and how deep they may lie. SB3's texts have a few hundred values, four deep.
 MAX_VALUES, MAX_DEPTH = 200_000, 64
@@ -25,6 +28,17 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("lists or objects are nested too deeply") from error
+
+
+def read_json_file(path: Path, most: int = MAX_TEXT) -> Any:
+    """
+    :param path: A file of JSON
+    :param most: The largest size that it may have, in bytes
+    :return: Its content
+    :raises OSError: If it cannot be read, or is no regular file
+    :raises ValueError: If it is too large, or no JSON
+    """
+    return parse_json(read_regular(path, most).decode("utf-8"))
 
 
 def read_plain_json(text: bytes, most: int = MAX_VALUES) -> Any:

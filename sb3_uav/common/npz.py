@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 import zipfile
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+
+from sb3_uav.common.checked_zip import check_number
+from sb3_uav.common.regular_file import open_regular
 
 # Upper bound of the compression ratio of deflate, which np.savez_compressed uses (https://zlib.net/zlib_tech.html).
 _GREATEST_COMPRESSION = 1032
@@ -28,7 +32,7 @@ def read_npz(path: Path, advice: str) -> dict[str, np.ndarray]:
     :raises ValueError: If it is not an intact ``.npz``, or holds anything but plain arrays
     """
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         raise ValueError(f"{path}: not an intact .npz of plain arrays ({error}); {advice}.") from error
     with stream:
@@ -47,6 +51,7 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
     """
     place = ""
     try:
+        check_number(stream)
         # Not np.load, which would also read a .npy or offer to unpickle whatever else it finds.
         with zipfile.ZipFile(stream) as file:
             arrays: dict[str, np.ndarray] = {}
@@ -54,7 +59,7 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
                 place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
                 _check_member(member)
             place = ""
-            _check_size(file)
+            _check_size(file, stream.seek(0, os.SEEK_END))
             for member in file.infolist():
                 place = f"array '{member.filename.removesuffix(_SUFFIX)}': "
                 if member.filename.removesuffix(_SUFFIX) in arrays:
@@ -67,12 +72,14 @@ def read_npz_stream(stream: IO[bytes], source: str, advice: str) -> dict[str, np
         raise ValueError(f"{source}: not an intact .npz of plain arrays ({place:.200}{found:.300}); {advice}.") from error
 
 
-def _check_size(file: zipfile.ZipFile) -> None:
+def _check_size(file: zipfile.ZipFile, n_bytes: int) -> None:
     """
     :param file: An opened archive
+    :param n_bytes: Its size. Members that lie in each other, each with the others as its numbers, claim more together
     :raises ValueError: If it would be many times larger in memory
     """
     packed, total = (sum(getattr(member, name) for member in file.infolist()) for name in ("compress_size", "file_size"))
+    packed = min(packed, n_bytes)
     if total > max(_ALWAYS_READ, _USUAL_COMPRESSION * packed):
         raise ValueError(f"its {packed} bytes would become {total} bytes, more than arrays of numbers shrink")
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from sb3_uav.common.files import remove_leftovers, replaced_when_complete
-from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.json_text import read_json_file
+from sb3_uav.common.regular_file import open_regular
 from sb3_uav.evaluation.instance_sets import InstanceSet
 from sb3_uav.evaluation.provenance import describe_machine, describe_solver
 from sb3_uav.evaluation.result_index import Place, ResultIndex
@@ -124,7 +125,7 @@ class EvaluationFolder:
         path = self.folder / SETTINGS_FILE
         remedy = "choose another folder, or start over with --overwrite"
         try:
-            earlier = parse_json(path.read_text(encoding="utf-8"))
+            earlier = read_json_file(path)
             # It is written again, without NaN.
             json.dumps(earlier, allow_nan=False)
             if earlier["format"] != FORMAT:
@@ -210,7 +211,7 @@ class EvaluationFolder:
 def _holds_results(path: Path) -> bool:
     """Whether there is a file that is not only a header of ours: all there is where a run was killed in its first instants."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(len(_HEADER) + 1) != _HEADER
     except FileNotFoundError:
         return False

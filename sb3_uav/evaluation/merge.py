@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_uav.common.files import replaced_when_complete
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.evaluation.folder import FORMAT
 from sb3_uav.evaluation.locking import locked_folder
 from sb3_uav.evaluation.result_index import Figures, ResultIndex
@@ -70,7 +71,7 @@ def _read(folder: Path) -> _Part:
     if not path.is_file() or not (folder / RESULTS_FILE).is_file():
         raise FileNotFoundError(f"{folder}: holds no {RESULTS_FILE} with {SETTINGS_FILE}; give the folders of the shards.")
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
+        settings = read_json_file(path)
         if settings["format"] != FORMAT:
             raise ValueError(f"its format is {settings['format']!r}, expected {FORMAT}")
         part = _Part(folder, settings)
@@ -147,7 +148,7 @@ def _check_replaceable(out: Path, overwrite: bool) -> None:
     if overwrite or not (out / RESULTS_FILE).exists():
         return
     try:
-        is_merged = "merged" in json.loads((out / SETTINGS_FILE).read_text(encoding="utf-8"))
+        is_merged = "merged" in read_json_file(out / SETTINGS_FILE)
     except (OSError, ValueError, TypeError):
         is_merged = False
     if not is_merged:

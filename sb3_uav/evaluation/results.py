@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.regular_file import open_regular
 
 RESULTS_FILE = "results.csv"
 SCHEDULES_FILE = "schedules.jsonl"
@@ -87,13 +88,14 @@ RESULT_COLUMNS = tuple(field.name for field in fields(ResultRow))
 # Of earlier versions, whose results are read and resumed as well.
 _EARLIER_COLUMNS = tuple(name for name in RESULT_COLUMNS if name != "unserved")
 _WHOLE_NUMBERS = {"instance", "n_uavs", "n_tasks", "seed", "batch_size", "unserved"}
-_COUNTS = _WHOLE_NUMBERS - {"seed"}
 _NUMBERS = {"objective", "length", "seconds", "time_limit", "bound"}
 _OPTIONAL = {"objective", "length", "seconds", "time_limit", "batch_size", "bound", "unserved"}
 
 
 # Whole numbers but seeds are below, so that the arrays of summaries hold them.
 _MAX_WHOLE_NUMBER = 2**31
+# A schedule of a million tasks takes 8 MB.
+_MAX_LINE = 16 * 2**20
 
 
 def one_line(text: object) -> str:
@@ -167,10 +169,16 @@ def whole_lines(path: Path) -> Iterator[Line]:
     :return: Its lines, except for a last one without a line break
     :raises ValueError: If it is not a text file
     """
-    offset = 0
-    with path.open("rb") as file:
+    offset = number = 0
+    with open_regular(path) as file:
         # In binary, where only line feeds end lines: other line breaks may be part of a name.
-        for number, content in enumerate(file, start=1):
+        while content := file.readline(_MAX_LINE + 1):
+            number += 1
+            if len(content) > _MAX_LINE:
+                raise ValueError(
+                    f"{path}: is damaged (line {number} has more than the {_MAX_LINE} bytes that are read); "
+                    "start over with --overwrite."
+                )
             if not content.endswith(b"\n"):
                 return
             try:
@@ -203,10 +211,9 @@ def parse_result(columns: Sequence[str], text: str) -> ResultRow:
             values[name] = None
         else:
             values[name] = int(values[name]) if name in _WHOLE_NUMBERS else float(values[name])
-        if name in _COUNTS and values[name] is not None and not 0 <= values[name] < 2**31:
-            raise ValueError(f"{name} is {values[name]}")
-            if not (math.isfinite(values[name]) if name in _NUMBERS else name == "seed" or values[name] < _MAX_WHOLE_NUMBER):
-                raise ValueError(f"{name} is {values[name]}")
+            is_within = math.isfinite(values[name]) if name in _NUMBERS else 0 <= values[name] < _MAX_WHOLE_NUMBER
+            if name != "seed" and not is_within:
+                raise ValueError(f"{name} is {values[name]}{', below 0' if values[name] < 0 else ''}")
     if values["feasible"] not in ("True", "False") or values["status"] not in (OK, INFEASIBLE, FAILED):
         raise ValueError(f"feasible is {values['feasible']!r} and status is {values['status']!r}")
     values["feasible"] = values["feasible"] == "True"
@@ -231,7 +238,7 @@ def iterate_schedules(path: Path) -> Iterator[tuple[Line, ResultKey]]:
     :return: Its lines, one after the other, with the results that they belong to
     :raises ValueError: If it was damaged
     """
-    if not path.is_file():
+    if not path.exists():
         return
     for line in whole_lines(path):
         try:

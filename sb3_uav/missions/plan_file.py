@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.envs.schedule import InfeasibleScheduleError, Schedule
 from sb3_uav.missions.checks import check_fleet, check_tasks
 from sb3_uav.missions.coordinates import System
@@ -177,7 +178,7 @@ def load_plan(path: Path) -> Plan:
     :raises ValueError: If it is not an intact plan
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json_file(path)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: this is not JSON ({error}).") from error
     return plan_from_json(data, str(path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sb3_uav.common.files import file_hash
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.envs.schedule import Schedule
 from sb3_uav.missions.flight import FlightOptions
 from sb3_uav.missions.plan import Plan
@@ -107,7 +107,7 @@ def _files_of(summary: Path) -> dict[str, str] | None:
     :return: Digests of its files by their names; None if it is no such summary
     """
     try:
-        data = json.loads(summary.read_text(encoding="utf-8"))
+        data = read_json_file(summary)
     except (OSError, ValueError, RecursionError):
         return None
     files = data.get("files") if isinstance(data, dict) and data.get("format") == FORMAT else None

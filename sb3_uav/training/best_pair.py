@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from sb3_uav.common.callback_tree import siblings, walk_callbacks
 from sb3_uav.common.divergence import DivergenceError
 from sb3_uav.common.files import file_hash, write_atomically
-from sb3_uav.common.json_text import parse_json
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.common.saving import save_atomically
 
 BEST_MODEL_FILE = "best_model.zip"
@@ -104,7 +104,7 @@ def find_best_router(folder: Path) -> Path | None:
     """
     plain = folder / _BEST_ROUTER_FILE
     try:
-        note = parse_json((folder / _PAIR_FILE).read_text(encoding="utf-8"))
+        note = read_json_file(folder / _PAIR_FILE)
         if note["model"] == file_hash(folder / BEST_MODEL_FILE):
             if note["router"] is None:
                 return None

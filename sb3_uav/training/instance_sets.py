@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_uav.common.regular_file import read_regular
 from sb3_uav.envs.generators import make_generator
 from sb3_uav.envs.instances import Instances
 from sb3_uav.training.fixed_set_returns import fingerprint
@@ -152,7 +153,7 @@ class SizeTable:
         :raises ValueError: If it is damaged or belongs to other sets
         """
         try:
-            reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
+            reader = csv.DictReader(io.StringIO(read_regular(path).decode("utf-8")))
             rows = [{name: float(value) for name, value in row.items()} for row in reader]
             # As they were written.
             rows = [{name: int(value) if name == "updates" else value for name, value in row.items()} for row in rows]

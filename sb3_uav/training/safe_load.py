@@ -38,6 +38,7 @@ from sb3_uav.training.episode_buffer import EpisodeRolloutBuffer, MaskableEpisod
 
 _PICKLE = ":serialized:"
 _STATES = ("policy.optimizer", "baseline_policy", "pytorch_variables")
+_SCHEDULES = {"learning_rate", "clip_range", "clip_range_vf"}
 # A new training makes them anew; ``lr_schedule`` comes from ``learning_rate``.
 _MADE_ANEW = {"_last_obs", "_last_original_obs", "_last_episode_starts", "lr_schedule"}
 # Objects, which a zip with plain data in their place would break.
@@ -62,12 +63,15 @@ _TYPES: dict[str, tuple[tuple[Any, ...], int]] = {
     **dict.fromkeys(("n_steps", "n_envs", "n_epochs", "n_samples", "instances_per_epoch"), ((int,), 1)),
     **dict.fromkeys(("n_batches", "n_instances", "epoch", "stream_seed", "verbose"), _WHOLE),
     **dict.fromkeys(("gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "lr_decay"), _NUMBER),
-    **dict.fromkeys(("seed", "batch_size"), ((int, None), 0)),
+    **dict.fromkeys(("seed", "batch_size", "max_instances"), ((int, None), 0)),
+    **dict.fromkeys(("_episode_num", "sde_sample_freq"), ((int,), -1)),
+    "_current_progress_remaining": _NUMBER,
     "steps_ahead": ((int,), -(2**62)),
     "start_time": _NUMBER,
     "tensorboard_log": _TEXT,
     **dict.fromkeys(("baseline_kwargs", "baseline_state", "rollout_buffer_kwargs", "its_checkpoint"), _MAP),
-    "use_sde": ((bool,), 0),
+    **dict.fromkeys(("use_sde", "normalize_advantage"), ((bool,), 0)),
+    "baseline": ((str,), 0),
 }
 # Of what one observation holds, and of the rollout buffer that SB3 makes before it is told that it is not needed.
 _MAX_OBSERVATION, _MAX_BUFFER = 2**22, 2**34
@@ -170,7 +174,7 @@ def observation_space_of(text: str) -> spaces.Dict | None:
         name, binary, low, high, box, dtype, n = match.groups()
         shape = tuple(int(part) for part in re.findall(r"\d{1,9}", binary or box or ""))
         size += math.prod(shape)
-        if size > _MAX_OBSERVATION or (n is not None and len(n) > 9):
+        if size > _MAX_OBSERVATION or 0 in shape or (n is not None and not 1 <= int(n[:10]) < 10**9):
             return None
         if binary is not None:
             found[name] = spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
@@ -251,13 +255,29 @@ def _check_sizes(stored: StoredPolicy, data: dict[str, Any]) -> None:
             continue
         if type(value) not in types or (isinstance(value, int) and not least <= value < 2**63) or value != value:
             raise ValueError(f"{stored.file}: {name} is {value!r:.40}; the zip was edited.")
+        # A gradient may be of any length.
+        if isinstance(value, float) and math.isinf(value) and name != "max_grad_norm":
+            raise ValueError(f"{stored.file}: {name} is {value}; the zip was edited.")
+    if (data.get("seed") or 0) >= 2**32:
+        raise ValueError(f"{stored.file}: seed is {data['seed']}, not below 2**32; the zip was edited.")
+    for name in _SCHEDULES & data.keys():
+        rate = data[name]
+        if not (callable(rate) or _is_rate(rate) or (rate is None and name == "clip_range_vf")):
+            raise ValueError(f"{stored.file}: {name} is {rate!r:.40}, not a number; the zip was edited.")
+    if data.get("rollout_buffer_kwargs"):
+        raise ValueError(
+            f"{stored.file}: rollout_buffer_kwargs is {data['rollout_buffer_kwargs']!r:.80}, but our buffers have no "
+            "settings; the zip was edited."
+        )
     for name in ("observation_space", "action_space"):
         if not isinstance(data.get(name), spaces.Space):
             raise NotOurPolicyError(f"{stored.file}: its {name} is not described in plain text; it is stored as a pickle.")
     space = data["observation_space"]
     parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    n_bytes = 4 * sum(math.prod(part.shape or ()) for part in parts) * (data.get("n_steps") or 1) * (data.get("n_envs") or 1)
-    if n_bytes > _MAX_BUFFER and "stream_seed" not in data:
+    # REINFORCE keeps no rollouts, so that its buffer is made for one step.
+    n_steps = 1 if "stream_seed" in data else data.get("n_steps") or 1
+    n_bytes = 4 * sum(math.prod(part.shape or ()) for part in parts) * n_steps * (data.get("n_envs") or 1)
+    if n_bytes > _MAX_BUFFER:
         raise ValueError(
             f"{stored.file}: n_steps {data.get('n_steps')} and n_envs {data.get('n_envs')} would take a rollout buffer of "
             f"{n_bytes} bytes; the zip was edited."
@@ -273,7 +293,8 @@ def _states(stored: StoredPolicy) -> dict[str, Any]:
     names = {f"{name}.pth": MAX_TENSOR_BYTES for name in _STATES}
     contents = read_members(stored.file, names, frozenset(names))
     found = {name.removesuffix(".pth"): read_state(stored.file, name, content) for name, content in contents.items()}
-    if found.pop("pytorch_variables", None):
+    variables = found.pop("pytorch_variables", None)
+    if variables is not None and not (isinstance(variables, dict) and not variables):
         raise ValueError(f"{stored.file}: 'pytorch_variables.pth' in it is not empty, as it is for our policies.")
     baseline = found.get("baseline_policy")
     if baseline is not None and not _alike(baseline, stored.parameters):
@@ -301,17 +322,47 @@ def _is_optimizer(state: Any, parameters: dict[str, th.Tensor]) -> bool:
     if not isinstance(state, dict) or state.keys() != {"state", "param_groups"}:
         return False
     states, groups = state["state"], state["param_groups"]
-    if not isinstance(states, dict) or not isinstance(groups, list) or not all(isinstance(group, dict) for group in groups):
+    # SB3's have one group.
+    if not isinstance(states, dict) or not isinstance(groups, list) or len(groups) != 1 or not _is_group(groups[0]):
+        return False
+    numbered = groups[0]["params"]
+    if len(numbered) > len(parameters) or not all(type(key) is int and 0 <= key < len(numbered) for key in states):
         return False
     shapes = {parameter.shape for parameter in parameters.values()} | {th.Size()}
-    numbers = [number for group in groups for number in group.values()]
     tensors = [tensor for moments in states.values() if isinstance(moments, dict) for tensor in moments.values()]
     return (
-        len(states) <= len(parameters)
-        and all(isinstance(moments, dict) for moments in states.values())
-        and all(_is_setting(number) for number in numbers)
+        all(isinstance(moments, dict) for moments in states.values())
         and all(_is_moment(tensor, shapes) for tensor in tensors)
+        and _are_in_order(states, parameters)
     )
+
+
+def _is_group(group: Any) -> bool:
+    """Whether these are the settings of an optimizer, for parameters that are numbered as torch does."""
+    if not isinstance(group, dict) or not isinstance(group.get("params"), list) or "lr" not in group:
+        return False
+    if group["params"] != list(range(len(group["params"]))) or not all(_is_setting(number) for number in group.values()):
+        return False
+    lr, betas = group["lr"], group.get("betas", (0.9, 0.999))
+    # The last two are for graphs of CUDA and for derivatives of steps; torch fails with them elsewhere.
+    return (
+        _is_rate(lr)
+        and isinstance(betas, list | tuple)
+        and len(betas) == 2
+        and all(0 <= beta < 1 for beta in betas)
+        and not group.get("capturable")
+        and not group.get("differentiable")
+    )
+
+
+def _are_in_order(states: dict[int, dict[str, Any]], parameters: dict[str, th.Tensor]) -> bool:
+    """Whether the moments of each parameter have one shape, and follow each other as the parameters do."""
+    left = iter(parameters.values())
+    for number in sorted(states):
+        shapes = {value.shape for value in states[number].values() if isinstance(value, th.Tensor) and value.ndim}
+        if len(shapes) > 1 or (shapes and not any(parameter.shape in shapes for parameter in left)):
+            return False
+    return True
 
 
 def _is_moment(value: Any, shapes: set[Any]) -> bool:
@@ -324,5 +375,15 @@ def _is_moment(value: Any, shapes: set[Any]) -> bool:
 def _is_setting(value: Any) -> bool:
     """Whether this is a setting of an optimizer: a finite number, a flag, or a few of them."""
     if isinstance(value, list | tuple):
-        return all(isinstance(part, int | float) and math.isfinite(part) for part in value)
-    return value is None or isinstance(value, bool) or (isinstance(value, int | float) and math.isfinite(value))
+        return all(_is_number(part) for part in value)
+    return value is None or _is_number(value)
+
+
+def _is_rate(value: Any) -> bool:
+    """Whether this can be a rate of learning or a range of clipping."""
+    return _is_number(value) and not isinstance(value, bool) and value >= 0
+
+
+def _is_number(value: Any) -> bool:
+    """Whether this is a finite number or a flag, and no whole number that exceeds all others."""
+    return (isinstance(value, int) and abs(value) < 2**63) or (isinstance(value, float) and math.isfinite(value))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.json_text import read_json_file
 
 _NOTE = "downloaded_from_hub.json"
 TRUST_FLAG = ("--trust", "unpickle the agent, which runs any code in it, where it cannot be read otherwise")
@@ -114,7 +115,7 @@ def _require_no_pickles(folder: Path, names: Collection[str], run_folder: Path) 
 def _remedy(run_folder: Path) -> str:
     """What to do, and where the run comes from if that is known."""
     try:
-        origin = json.loads((run_folder / _NOTE).read_text(encoding="utf-8"))["repo_id"]
+        origin = read_json_file(run_folder / _NOTE)["repo_id"]
     except (OSError, ValueError, LookupError, TypeError):
         return _REMEDY
     return f"{run_folder} comes from {origin!s:.100} on the Hugging Face Hub. {_REMEDY}"

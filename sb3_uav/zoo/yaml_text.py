@@ -7,9 +7,14 @@ from typing import Any
 
 import yaml
 
-# The zoo's own files have a few thousand values in 40 KiB.
-_MOST_BYTES = 2**20
-_MOST_VALUES = 100_000
+from sb3_uav.common.regular_file import open_regular
+
+# The zoo's own files have a few thousand values in 40 KiB. PyYAML makes 50,000 values a second.
+_MOST_BYTES = 2**18
+_MOST_WRITTEN, _MOST_VALUES = 20_000, 100_000
+# Of a number: those to the base of 60 (`1:1:1`) take time that grows with the square of their length.
+_MOST_DIGITS = 100
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 _MOST_DEPTH = 50
 
 
@@ -21,11 +26,11 @@ def load_yaml(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
     :raises ValueError: If it cannot be read, or aliases make it endless or huge; the message names the file
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             data = file.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
             raise ValueError(f"it has more than {_MOST_BYTES} bytes")
-        reader = loader(data.decode("utf-8"))
+        reader = _limited(loader(data.decode("utf-8")))
         try:
             node = reader.get_single_node()
             if node is None:
@@ -40,6 +45,25 @@ def load_yaml(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
         # KeyError for `!!bool no`, AttributeError for `!!timestamp x`, RecursionError for brackets without end.
         found = str(error) if isinstance(error, yaml.YAMLError | ValueError | OSError) else repr(error)
         raise ValueError(f"{path}: cannot be read as YAML: {found:.1000}") from error
+
+
+def _limited(reader: yaml.SafeLoader) -> yaml.SafeLoader:
+    """
+    :param reader: A loader that has not begun
+    :return: The same, which stops at the first value too many
+    """
+    compose, found = reader.compose_node, 0
+
+    def counted(*place: Any) -> yaml.Node | None:
+        nonlocal found
+        found += 1
+        if found > _MOST_WRITTEN:
+            raise ValueError(f"it has more than {_MOST_WRITTEN} values")
+        return compose(*place)
+
+    # Of this object only, as the class of loader is the caller's.
+    vars(reader)["compose_node"] = counted
+    return reader
 
 
 def _count(node: yaml.Node, known: dict[int, int], depth: int) -> int:
@@ -59,6 +83,8 @@ def _count(node: yaml.Node, known: dict[int, int], depth: int) -> int:
         raise ValueError("lists or mappings are nested too deeply")
     known[id(node)] = 0
     total = 1
+    if isinstance(node, yaml.ScalarNode) and node.tag in _NUMBERS and len(node.value) > _MOST_DIGITS:
+        raise ValueError(f"a number has {len(node.value)} digits, more than the {_MOST_DIGITS} that are read")
     if isinstance(node, yaml.CollectionNode):
         for item in node.value:
             total += sum(_count(part, known, depth + 1) for part in (item if isinstance(item, tuple) else (item,)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from sb3_uav.common.regular_file import read_regular
 from sb3_uav.evaluation.benchmarks.instance import finite_number
 
 COLUMNS = ("instance", "best_known")
@@ -21,7 +22,7 @@ def read_best_known(path: Path) -> dict[str, float]:
         raise FileNotFoundError(f"{path}: no such file; give a CSV with the columns {','.join(COLUMNS)}.")
     try:
         # A byte order mark, as spreadsheets write it, is none of the name of the first column.
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_regular(path).decode("utf-8-sig").splitlines()
         rows = list(csv.reader(lines, strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: is no CSV in UTF-8 ({error}); write it again.") from error

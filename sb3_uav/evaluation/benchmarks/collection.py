@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sb3_uav.common.regular_file import read_regular
 from sb3_uav.envs.instances import Instances
 from sb3_uav.evaluation.benchmarks.chao import read_chao
 from sb3_uav.evaluation.benchmarks.instance import BenchmarkInstance
@@ -133,7 +134,7 @@ def _read_file(path: Path, group: str, is_known: bool) -> list[BenchmarkInstance
     if path.suffix.lower() not in _TEXT_SUFFIXES and not is_known:
         return None
     # Comments may be in any encoding; where numbers are damaged, the readers say so.
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_regular(path).decode("utf-8", "replace")
     first = text.split(maxsplit=1)[:1]
     if "_SECTION" in text:
         return [read_oplib(path, text, group)]

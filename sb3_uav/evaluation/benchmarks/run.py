@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_uav.common.files import write_atomically
+from sb3_uav.common.json_text import read_json_file
 from sb3_uav.evaluation.benchmarks.collection import BenchmarkFolder, batch_of, evaluation_sets
 from sb3_uav.evaluation.benchmarks.gaps import GAPS_FILE, ROUTES_FILE, GapRow, find_gaps, write_gaps
 from sb3_uav.evaluation.benchmarks.summary_file import SUMMARY_FILE, summary_text
@@ -107,7 +107,7 @@ def check_same_instances(folder: Path, benchmark: BenchmarkFolder) -> None:
     :raises ValueError: If it is not the one that was evaluated
     """
     try:
-        described = json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))["instances"]
+        described = read_json_file(folder / SETTINGS_FILE)["instances"]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{folder / SETTINGS_FILE}: does not describe an evaluation ({error}).") from error
     sets = evaluation_sets(list(benchmark.instances.values()))

@@ -35,6 +35,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from sb3_uav.common.regular_file import open_regular
 from sb3_uav.missions.coordinates import System
 from sb3_uav.missions.readers.table import DELIMITERS, decoded
 from sb3_uav.missions.status import KINDS, NewTask, RemainingUnit, Status, UavReport
@@ -139,7 +140,7 @@ def read_status(path: Path) -> Status:
     :raises OSError: If the file cannot be read
     :raises ValueError: If something in it is wrong; the message names the row
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return read_status_from_bytes(file.read(_MAX_BYTES + 1), str(path))
 
 
