@@ -204,3 +204,17 @@ def test_a_comparison_and_a_reproduction_name_their_own_command(
     ):
         assert main(words) == 130
         assert continuation(capsys) == ["sb3-uav", *words]
+
+
+def handling(*_: Any) -> tuple[int, Any]:
+    return 0, signal.getsignal(signal.SIGINT)
+
+
+@pytest.mark.slow
+def test_processes_of_bounds_leave_the_interruption_to_the_main_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each would print a traceback."""
+    from sb3_uav.cli import bound
+
+    monkeypatch.setattr(bound, "_bound_of", handling)
+    found: list[Any] = list(bound._bounds(Path(), 2, 1.0, 2))
+    assert found == [(0, signal.SIG_IGN)] * 2

@@ -51,13 +51,14 @@ def is_launched() -> bool:
 
 
 @contextmanager
-def process_group() -> Iterator[None]:
+def process_group(timeout: timedelta = _TIMEOUT) -> Iterator[None]:
     """
     Connect the processes that ``torchrun`` has started, by gloo for tensors on the CPU and NCCL for those on GPUs.
 
     Of an error that several of them raise only the first is passed on, and of an interruption only that of rank 0; the others
     end with ``SystemExit``.
 
+    :param timeout: How long one of them may wait for another
     :raises ValueError: If this process lost the connection to another one
     :raises Interruption: In place of one on rank 0, with the command that starts all processes again
     """
@@ -72,7 +73,7 @@ def process_group() -> Iterator[None]:
         th.cuda.set_device(local_rank)
     root, number, size = next(dist.rendezvous("env://", timeout=_TIMEOUT))
     backend = "cpu:gloo,cuda:nccl" if has_gpus else "gloo"
-    dist.init_process_group(backend, store=dist.PrefixStore("group", root), rank=number, world_size=size, timeout=_TIMEOUT)
+    dist.init_process_group(backend, store=dist.PrefixStore("group", root), rank=number, world_size=size, timeout=timeout)
     store = dist.PrefixStore("errors", root)
     try:
         yield
