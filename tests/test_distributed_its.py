@@ -2,6 +2,7 @@
 
 import io
 import json
+import signal
 from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
@@ -12,6 +13,7 @@ from ranks import run_ranks
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.logger import configure
 
+from sb3_uav.common import distributed, interruption
 from sb3_uav.common.random_streams import random_stream
 from sb3_uav.envs.allocation import TaskAllocationEnv
 from sb3_uav.envs.generators import UniformGenerator
@@ -201,6 +203,25 @@ def test_command_line(tmp_path, monkeypatch):
     # 10 instances with 2 samples, each once.
     assert len((run / "0.monitor.csv").read_text().splitlines()) == 2 + 10 * 2
     assert len(list((tmp_path / "tb").rglob("events.*"))) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_late", [False, True])
+def test_command_line_reports_an_interruption_once(is_late, tmp_path, monkeypatch):
+    def interrupted(_):
+        if is_late and distributed.is_main():
+            # The other process ends, and with it the connection, before this one comes to its signal.
+            monkeypatch.setattr(interruption, "_received", signal.SIGINT)
+            raise RuntimeError("Connection closed by peer")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ITSCallback, "_begin_epoch", interrupted)
+    codes, _, errors = train_as_torchrun(tmp_path, monkeypatch)
+    assert codes == (130, 130) and errors[1] == ""
+    line, words = errors[0].splitlines()[-1].split("; continue with ")
+    assert line == "sb3-uav train: interrupted" and errors[0].count("interrupted") == 1
+    assert words.split()[:6] == ["torchrun", "--nproc-per-node", "2", "-m", "sb3_uav", "train"]
+    assert words.split()[-2] == "-i" and (tmp_path / words.split()[-1]).is_file()
 
 
 def test_command_line_reports_an_error_once(tmp_path, monkeypatch):

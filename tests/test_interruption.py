@@ -141,6 +141,27 @@ def test_a_training_without_a_checkpoint_names_no_command(
     assert capsys.readouterr().err.splitlines()[-1] == "sb3-uav train: interrupted"
 
 
+@pytest.mark.slow
+def test_an_interrupted_study_reports_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """rl_zoo3 would report its best trial so far, or that all of them were pruned."""
+    pytest.importorskip("rl_zoo3")
+    from tiny_zoo import ENV, run, write_config
+
+    from sb3_uav.zoo import experiment
+
+    monkeypatch.setattr(experiment, "note_worker", raise_interrupt)
+    config, flags = write_config(tmp_path), ["-optimize", "--n-trials", "1", "--no-optim-plots"]
+    assert run(tmp_path, config, *flags) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "sb3-uav train: interrupted"
+    study = ["--storage", str(tmp_path / "study.log"), "--study-name", "small"]
+    assert run(tmp_path, config, *flags, *study) == 130
+    words = continuation(capsys)
+    assert words[:4] == ["sb3-uav", "train", "--env", ENV] and words[-4:] == study
+    assert not list(tmp_path.rglob("report_*"))
+
+
 def test_the_demo_evaluates_no_unfinished_pair(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -158,6 +179,12 @@ def test_the_demo_evaluates_no_unfinished_pair(
     monkeypatch.setattr(demo, "evaluate_run", lambda *args: evaluated.append(args))
     assert main(["demo", "--out", str(tmp_path), "-i", "older.zip"]) == 130
     assert continuation(capsys) == ["sb3-uav", "demo", "--out", str(tmp_path), "-i", "a.zip"] and not evaluated
+    # In the evaluation of a run without checkpoints.
+    monkeypatch.setattr(train, "train", lambda _: None)
+    monkeypatch.setattr(demo, "newest_run", lambda *_: tmp_path)
+    monkeypatch.setattr(demo, "evaluate_run", raise_interrupt)
+    assert main(["demo", "--out", str(tmp_path)]) == 130
+    assert continuation(capsys) == ["sb3-uav", "demo", "--out", str(tmp_path)]
 
 
 def test_a_comparison_and_a_reproduction_name_their_own_command(
@@ -177,3 +204,17 @@ def test_a_comparison_and_a_reproduction_name_their_own_command(
     ):
         assert main(words) == 130
         assert continuation(capsys) == ["sb3-uav", *words]
+
+
+def handling(*_: Any) -> tuple[int, Any]:
+    return 0, signal.getsignal(signal.SIGINT)
+
+
+@pytest.mark.slow
+def test_processes_of_bounds_leave_the_interruption_to_the_main_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each would print a traceback."""
+    from sb3_uav.cli import bound
+
+    monkeypatch.setattr(bound, "_bound_of", handling)
+    found: list[Any] = list(bound._bounds(Path(), 2, 1.0, 2))
+    assert found == [(0, signal.SIG_IGN)] * 2

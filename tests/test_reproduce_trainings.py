@@ -16,6 +16,7 @@ import pytest
 import torch as th
 
 from sb3_uav.policies.loading import load_policy
+from sb3_uav.reproduce import training_processes
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair, training_entry
 from sb3_uav.reproduce.pairs import Models
 from sb3_uav.reproduce.scales import _SMOKE, Scenario
@@ -101,6 +102,20 @@ def test_a_failed_process_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     sender.close()
     with pytest.raises(TrainingError, match="U4-80, its failed: its process died; was it out of memory"):
         _TrainingProcess(broken, over, receiver).check()  # type: ignore[arg-type]
+
+
+def test_a_process_that_the_main_one_ends_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A KeyboardInterrupt that leaves a process of multiprocessing is printed with its traceback."""
+
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training_processes, "train_pair", interrupted)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    with receiver, sender, pytest.raises(SystemExit) as end:
+        _train_in_process(job(tmp_path), sender)
+    assert end.value.code == 130
 
 
 @pytest.mark.slow

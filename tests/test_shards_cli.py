@@ -6,15 +6,20 @@ import os
 import shutil
 import subprocess
 import sys
+from argparse import Namespace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch.distributed as dist
 from benchmark_files import BEST_KNOWN, FILES
 from evaluation_helpers import contents
+from ranks import run_ranks
 
 from sb3_uav.cli import main as cli
+from sb3_uav.cli import shards
 from sb3_uav.envs import UniformGenerator
 
 pytest.importorskip("rich")
@@ -131,3 +136,23 @@ def test_processes_of_torchrun(tmp_path: Path) -> None:
     assert sb3_uav(*command[:-1], tmp_path / "whole") == 0
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
     assert {path.name for path in (tmp_path / "out").iterdir() if path.is_dir()} == {"shard-1-of-2", "shard-2-of-2"}
+
+
+def test_processes_wait_for_the_longest_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One may have nothing left to do when a run is resumed, and another one all of its shard."""
+    waits: list[Any] = []
+    make = dist.init_process_group
+
+    def init(*args: Any, **kwargs: Any) -> None:
+        waits.append(kwargs["timeout"])
+        make(*args, **kwargs)
+
+    monkeypatch.setattr(dist, "init_process_group", init)
+
+    def run(_: int) -> Any:
+        args = Namespace(shard=None, out=tmp_path)
+        joined = shards.run_shard(args, lambda shard, out: str(shard), lambda folders, out: [path.name for path in folders])
+        return joined, waits
+
+    found = run_ranks(2, tmp_path / "ranks", run, connected=False)
+    assert found == [(["shard-1-of-2", "shard-2-of-2"], [timedelta(days=365)]), (None, [timedelta(days=365)])]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -78,7 +79,8 @@ def _bounds(path: Path, n_rows: int, time_limit: float, n_jobs: int) -> Iterator
         return
     # Not by fork: torch and numba have threads.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(n_jobs, n_rows), mp_context=context) as pool:
+    # Ctrl-C reaches all processes of a terminal; the main one says so, and ends the others.
+    with ProcessPoolExecutor(min(n_jobs, n_rows), context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         futures = [pool.submit(_bound_of, path, row, time_limit) for row in range(n_rows)]
         try:
             for future in as_completed(futures):

@@ -62,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return evaluate_run(run, args.env, args.out, args.n_instances, args.seed)
     except KeyboardInterrupt as error:
         # A training that is complete ends at once.
-        raise _continued(arguments, ("-i", str(newest_checkpoint(run)))) from error
+        checkpoint = newest_checkpoint(run)
+        raise _continued(arguments, () if checkpoint is None else ("-i", str(checkpoint))) from error
 
 
 def _continued(arguments: Sequence[str], changes: Sequence[str]) -> Interruption:

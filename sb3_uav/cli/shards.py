@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,6 +12,9 @@ from sb3_uav.common.distributed import barrier, is_launched, is_main, on_main, p
 from sb3_uav.evaluation.shard import Shard
 
 ResultT = TypeVar("ResultT")
+# One process may have nothing left to do when a run is resumed, and another one all of its shard. torchrun ends all of them if
+# one fails.
+_LONGEST_WAIT = timedelta(days=365)
 
 
 def run_shard(
@@ -32,7 +36,7 @@ def run_shard(
         return run(Shard.parse(args.shard or "1/1"), args.out)
     if args.shard is not None:
         raise ValueError(f"--shard is {args.shard}, but torchrun shares out the instances itself; leave it out.")
-    with process_group():
+    with process_group(_LONGEST_WAIT):
         folders = [args.out / f"shard-{number}-of-{world_size()}" for number in range(1, world_size() + 1)]
         run(Shard(rank() + 1, world_size()), folders[rank()])
         barrier()

@@ -20,6 +20,8 @@ from typing import Any, TypeVar, cast
 import torch as th
 import torch.distributed as dist
 
+from sb3_uav.common.interruption import Interruption, exit_code, was_received
+
 ResultT = TypeVar("ResultT")
 
 # Longer than any evaluation on rank 0, for which the others wait. torchrun ends them at once if a process fails.
@@ -49,13 +51,16 @@ def is_launched() -> bool:
 
 
 @contextmanager
-def process_group() -> Iterator[None]:
+def process_group(timeout: timedelta = _TIMEOUT) -> Iterator[None]:
     """
     Connect the processes that ``torchrun`` has started, by gloo for tensors on the CPU and NCCL for those on GPUs.
 
-    Of an error that several of them raise only the first is passed on; the others end with ``SystemExit``.
+    Of an error that several of them raise only the first is passed on, and of an interruption only that of rank 0; the others
+    end with ``SystemExit``.
 
+    :param timeout: How long one of them may wait for another
     :raises ValueError: If this process lost the connection to another one
+    :raises Interruption: In place of one on rank 0, with the command that starts all processes again
     """
     if not is_launched() or world_size() > 1:
         yield
@@ -68,14 +73,19 @@ def process_group() -> Iterator[None]:
         th.cuda.set_device(local_rank)
     root, number, size = next(dist.rendezvous("env://", timeout=_TIMEOUT))
     backend = "cpu:gloo,cuda:nccl" if has_gpus else "gloo"
-    dist.init_process_group(backend, store=dist.PrefixStore("group", root), rank=number, world_size=size, timeout=_TIMEOUT)
+    dist.init_process_group(backend, store=dist.PrefixStore("group", root), rank=number, world_size=size, timeout=timeout)
     store = dist.PrefixStore("errors", root)
     try:
         yield
         # Nobody ends, and takes the connection with it, while another one still works.
         barrier()
         dist.destroy_process_group()
+    except KeyboardInterrupt as error:
+        raise _interruption(number, error) from error
     except (ValueError, OSError, ImportError, RuntimeError) as error:
+        if was_received():
+            # All of them were interrupted, and another one has ended before this one.
+            raise _interruption(number, KeyboardInterrupt()) from error
         if not _is_first(store):
             # Not even its traceback: the error is that of another process, or the end of its connection.
             raise SystemExit(_USER_ERROR) from None
@@ -85,6 +95,23 @@ def process_group() -> Iterator[None]:
                 f"again, from the last checkpoint ({' '.join(str(error).split())[:120]})."
             ) from error
         raise
+
+
+def _interruption(number: int, error: KeyboardInterrupt) -> BaseException:
+    """
+    :param number: The rank
+    :param error: What interrupted it
+    :return: What it ends with
+    """
+    if number > 0:
+        return SystemExit(exit_code())
+    if not isinstance(error, Interruption) or not error.words:
+        return error
+    n_nodes = os.environ.get("GROUP_WORLD_SIZE", "1")
+    launcher = ["torchrun", *(["--nnodes", n_nodes] if n_nodes != "1" else [])]
+    launcher += ["--nproc-per-node", os.environ.get("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])]
+    # The command's name is that of the package's script; torchrun starts modules.
+    return Interruption([*launcher, "-m", error.words[0].replace("-", "_"), *error.words[1:]], error.changes)
 
 
 def _is_first(store: Any) -> bool:

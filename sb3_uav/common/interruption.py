@@ -80,6 +80,11 @@ def is_interruption(code: int) -> bool:
     return code - _SIGNAL_BASE in _SIGNALS
 
 
+def was_received() -> bool:
+    """:return: Whether a signal has interrupted this command"""
+    return _received is not None
+
+
 def exit_code() -> int:
     """:return: That of an interrupted command: 143 after SIGTERM, 130 after Ctrl-C"""
     return _SIGNAL_BASE + (signal.SIGINT if _received is None else _received)

@@ -10,6 +10,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
 from typing import NamedTuple
 
+from sb3_uav.common.interruption import exit_code
 from sb3_uav.reproduce.epoch_lines import EpochLines
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair
 
@@ -86,6 +87,9 @@ def _train_in_process(job: PairTraining, errors: connection.Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         train_pair(job)
+    except KeyboardInterrupt:
+        # The main process has ended this one, and says so.
+        raise SystemExit(exit_code()) from None
     except Exception as error:
         errors.send(str(error))
         raise SystemExit(1) from error

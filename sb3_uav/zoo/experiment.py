@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_uav.common import distributed
 from sb3_uav.common.divergence import DivergenceError, note_saved, require_finite_model, with_checkpoint
-from sb3_uav.common.interruption import Interruption
+from sb3_uav.common.interruption import Interruption, continued_by, was_received
 from sb3_uav.common.random_streams import EVALUATION_SEED
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
@@ -30,7 +30,7 @@ from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint, new
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
-from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, optuna, rl_zoo3
+from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, interruptible_studies, optuna, rl_zoo3
 from sb3_uav.zoo.run_folders import RunFolderGuard, make_run_folder, require_folder
 from sb3_uav.zoo.shared_study import SeedPerTrial, fail_trials_of_dead_workers, note_worker, shared_studies
 from sb3_uav.zoo.tuning import StopWhenDiverged, has_success, register_search_spaces
@@ -157,6 +157,11 @@ class UAVExperimentManager(ExperimentManager):
         noted = _InterruptionNoted(model)
         try:
             super().learn(noted)  # type: ignore[arg-type]
+        except (KeyboardInterrupt, RuntimeError) as error:
+            # While rl_zoo3 released what the training had used, or as a lost connection: another process has ended first.
+            if isinstance(error, RuntimeError) and not was_received():
+                raise
+            noted.interruption = error
         except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
@@ -298,7 +303,7 @@ class UAVExperimentManager(ExperimentManager):
         # By name, so that every trial gets its own instance.
         self.specified_callbacks = [*kept, f"{StopWhenDiverged.__module__}.{StopWhenDiverged.__name__}"]
         try:
-            with shared_studies():
+            with shared_studies(), continued_by(()), interruptible_studies():
                 super().hyperparameters_optimization()
         except ValueError as error:
             if "No trials are completed" not in str(error):
@@ -349,7 +354,7 @@ class _InterruptionNoted:
 
     def __init__(self, model: BaseAlgorithm) -> None:
         self.model = model
-        self.interruption: KeyboardInterrupt | None = None
+        self.interruption: BaseException | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.model, name)

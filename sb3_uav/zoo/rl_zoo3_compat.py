@@ -194,6 +194,34 @@ def created_studies(opened: Callable[[Any], Any], started: Callable[[optuna.Stud
         yield
 
 
+class _StudyInterrupted(BaseException):
+    """Ctrl-C, as rl_zoo3 does not catch it."""
+
+
+@contextmanager
+def interruptible_studies() -> Iterator[None]:
+    """
+    Pass Ctrl-C on, which rl_zoo3 takes for the end of ``-optimize``: it would report the best trial and end well.
+
+    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L964
+
+    :raises KeyboardInterrupt: After Ctrl-C in a trial or between trials
+    """
+    optimize = optuna.Study.optimize
+
+    def pass_on(study: optuna.Study, *args: Any, **kwargs: Any) -> None:
+        try:
+            optimize(study, *args, **kwargs)
+        except KeyboardInterrupt as error:
+            raise _StudyInterrupted from error
+
+    try:
+        with _replaced(optuna.Study, "optimize", pass_on):
+            yield
+    except _StudyInterrupted as error:
+        raise KeyboardInterrupt from error
+
+
 @contextmanager
 def default_vec_env(make: _MakeVecEnv) -> Iterator[None]:
     """

@@ -67,6 +67,8 @@ def _train(arguments: Sequence[str]) -> None:
     parser.add_argument("-P", "--progress", action="store_true")
     parser.add_argument("--track", action="store_true")
     parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--storage")
+    parser.add_argument("--study-name")
     parser.add_argument("--trust", action="store_true")
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
@@ -114,7 +116,8 @@ def _train(arguments: Sequence[str]) -> None:
         try:
             rl_zoo3.train.train()
         except Interruption as error:
-            raise _continued(given, known.trained_agent, error.changes) from error
+            is_kept = known.trained_agent is not None or None not in (known.storage, known.study_name)
+            raise _continued(given, is_kept, error.changes) from error
 
 
 @contextmanager
@@ -136,16 +139,16 @@ def _readable_errors() -> Iterator[None]:
         raise ValueError(f"--track: {error} Or set WANDB_MODE=offline.") from error
 
 
-def _continued(arguments: Sequence[str], trained_agent: str | None, changes: Sequence[str]) -> Interruption:
+def _continued(arguments: Sequence[str], is_kept: bool, changes: Sequence[str]) -> Interruption:
     """
     :param arguments: Of the interrupted command
-    :param trained_agent: Its ``-i``
+    :param is_kept: Whether what it began with is still there: its ``-i``, or a study in a storage
     :param changes: That of the command that continues; empty if nothing was saved
     :return: What says how to go on
     """
     if not changes:
         # From where it began.
-        return Interruption([] if trained_agent is None else [*_PROG.split(), *arguments])
+        return Interruption([*_PROG.split(), *arguments] if is_kept else [])
     kept = without_option(arguments, ("-i", "--trained-agent"))
     return Interruption([*_PROG.split(), *kept, *changes], changes)
 
