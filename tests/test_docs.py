@@ -14,7 +14,9 @@ DOCS = ROOT / "docs"
 DOCUMENTS = sorted(
     [*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "examples").rglob("*.md"), *(ROOT / "sb3_uav").rglob("*.md")]
 )
-PNGS, PDFS = sorted(DOCS.rglob("*.png")), sorted(DOCS.rglob("*.pdf"))
+# Without the built site (`make docs`), whose theme has small icons.
+PNGS = sorted(path for path in DOCS.rglob("*.png") if "_build" not in path.relative_to(DOCS).parts)
+PDFS = sorted(DOCS.rglob("*.pdf"))
 # [text](target), ![text](target "title") and [name]: target
 (REPOSITORY,) = re.findall(r"^url = (\S+)$", (ROOT / "setup.cfg").read_text(encoding="utf-8"), flags=re.MULTILINE)
 OURS = re.compile(rf"(?:{REPOSITORY}/(?:blob|tree)|{REPOSITORY.replace('github', 'raw.githubusercontent')})/main/")

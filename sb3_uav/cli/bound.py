@@ -24,7 +24,7 @@ CSV has the columns instance,bound,seconds,status, a line per instance, and is c
 
 status:
   optimal      a schedule of this value was found: it is the best, and the bound is its value
-  bound        more time lowers it no more
+  bound        more time does not lower it
   time limit   more time might lower it
 
 exit code:
@@ -37,7 +37,7 @@ exit code:
 def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-uav bound",
-        description="Bound from above what any schedule of each instance can be worth, with a proof, however short the time.",
+        description="Prove an upper bound on the value of any schedule of each instance; valid however short the time limit.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -25,7 +25,7 @@ _FORWARDED = {
     "solve": ("sb3_uav.cli.solve:main", "plan missions over a list of tasks: CSV, GeoJSON, .plan, ... to missions that fly"),
     "replan": ("sb3_uav.cli.replan:main", "plan a mission again while its UAVs are in the air"),
     "evaluate": ("sb3_uav.cli.evaluate:main", "evaluate zips and solvers on the same instances"),
-    "bound": ("sb3_uav.cli.bound:main", "bound from above what any schedule of each instance can be worth"),
+    "bound": ("sb3_uav.cli.bound:main", "prove an upper bound on the value of any schedule"),
     "bench": ("sb3_uav.cli.bench:main", "compare solvers with the best-known values of public benchmarks"),
     "merge": ("sb3_uav.cli.merge:main", "join the results of the shards of an evaluation or benchmark"),
     "anytime": ("sb3_uav.cli.anytime:main", "draw objective against time from an evaluation"),

@@ -12,7 +12,7 @@ Joins what `sb3-uav evaluate` or `sb3-uav bench` wrote with --shard 1/N to --sha
 without shards does. The folders must agree in instances, solvers, settings and versions, hold no result twice and miss none.
 Of a benchmark, its folder and best-known values are read again, at the paths that were given to the shards.
 
-exit code: as of `sb3-uav evaluate` and `sb3-uav bench`; 2 if the folders do not make one evaluation, and nothing is written
+exit code: as for `sb3-uav evaluate` and `sb3-uav bench`; 2 if the folders do not make one evaluation, and nothing is written
 """
 
 
@@ -25,9 +25,9 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of all shards, in any order")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the whole evaluation")
-    parser.add_argument("--overwrite", action="store_true", help="replace an evaluation in DIR; an earlier merge always is")
-    parser.add_argument("--benchmark", type=Path, metavar="FOLDER", help="of a benchmark, if its files are elsewhere now")
-    parser.add_argument("--best-known", type=Path, metavar="CSV", help="the same for its best-known values")
+    parser.add_argument("--overwrite", action="store_true", help="replace an evaluation in DIR; earlier merges always are")
+    parser.add_argument("--benchmark", type=Path, metavar="FOLDER", help="folder of the benchmark, if it has moved")
+    parser.add_argument("--best-known", type=Path, metavar="CSV", help="file of best-known values, if it has moved")
     return parser
 
 
