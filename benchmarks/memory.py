@@ -82,7 +82,7 @@ def measure_peak(size: str, n_samples: int) -> None:
     model.learn_instances(2 * model.n_envs)
     measured = peak_memory() - before
     print(
-        f"{size}: estimated {estimated / _GIB:.2f} GiB, measured {measured / _GIB:.2f} GiB, ratio {estimated / measured:.2f}",
+        f"{size}: estimated {estimated / _GIB:.2f} GiB, measured {measured / _GIB:.2f} GiB, ratio {estimated / max(measured, 1):.2f}",
         flush=True,
     )
 

@@ -144,4 +144,4 @@ def test_yaml_entry_of_the_documentation(tmp_path, monkeypatch):
     assert cli.main(["train", *command, "--conf-file", "my.yml", "-f", "logs", "--eval-freq", "256"]) == 0
     (found,) = (tmp_path / "logs" / "ppo").glob("Pick-v0_1/Pick-v0.zip")
     assert isinstance(PPO.load(found, device="cpu").policy, MaskedAttentionPolicy)
-    assert cli.main(["enjoy", *command, "-f", "logs", "-n", "50", "--no-render"]) == 0
+    assert cli.main(["enjoy", *command, "-f", "logs", "-n", "50", "--no-render", "--trust"]) == 0
