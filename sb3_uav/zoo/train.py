@@ -12,7 +12,7 @@ from pathlib import Path
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common import distributed
 from sb3_uav.common.errors import main_function
-from sb3_uav.common.interruption import Interruption, without_option
+from sb3_uav.common.interruption import Interruption
 from sb3_uav.common.optional import require
 from sb3_uav.common.random_streams import draw_seed
 from sb3_uav.pretrained import names
@@ -67,6 +67,7 @@ def _train(arguments: Sequence[str]) -> None:
     parser.add_argument("-P", "--progress", action="store_true")
     parser.add_argument("--track", action="store_true")
     parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--storage")
     parser.add_argument("--trust", action="store_true")
     parser.add_argument("-h", "--help", action="store_true")
     known, _ = parser.parse_known_args(arguments)
@@ -115,6 +116,9 @@ def _train(arguments: Sequence[str]) -> None:
             rl_zoo3.train.train()
         except Interruption as error:
             raise _continued(given, known.trained_agent, error.changes) from error
+        except KeyboardInterrupt as error:
+            # A study in a storage goes on with the trials that it has.
+            raise Interruption([*_PROG.split(), *given] if known.storage is not None else []) from error
 
 
 @contextmanager
@@ -146,8 +150,9 @@ def _continued(arguments: Sequence[str], trained_agent: str | None, changes: Seq
     if not changes:
         # From where it began.
         return Interruption([] if trained_agent is None else [*_PROG.split(), *arguments])
-    kept = without_option(arguments, ("-i", "--trained-agent"))
-    return Interruption([*_PROG.split(), *kept, *changes], changes)
+    from sb3_uav.zoo.interrupted import with_changes
+
+    return Interruption([*_PROG.split(), *with_changes(arguments, changes)], changes)
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.
