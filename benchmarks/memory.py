@@ -81,8 +81,9 @@ def measure_peak(size: str, n_samples: int) -> None:
     estimated, model = estimate(size, n_samples)
     model.learn_instances(2 * model.n_envs)
     measured = peak_memory() - before
+    ratio = estimated / max(measured, 1)
     print(
-        f"{size}: estimated {estimated / _GIB:.2f} GiB, measured {measured / _GIB:.2f} GiB, ratio {estimated / max(measured, 1):.2f}",
+        f"{size}: estimated {estimated / _GIB:.2f} GiB, measured {measured / _GIB:.2f} GiB, ratio {ratio:.2f}",
         flush=True,
     )
 

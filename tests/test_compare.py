@@ -272,15 +272,15 @@ class Fake(ZooTraining):
     def flags(self) -> list[str]:
         target = self.folder / self.algo / f"{self.env_id}_1"
         script = f"""
-import os, signal, sys, time
-import numpy as np
+import os, signal, sys, time, numpy as np
 {self.config.read_text()}
 os.makedirs({str(target)!r})
-one = np.ones((2, 3))
+one, seconds = np.ones((2, 3)), [0.0, 1.0]
 np.savez({str(target / "evaluations.npz")!r}, timesteps=[0, steps], results=one, ep_lengths=one, sampled=one,
-         train_seconds=[0.0, 1.0], cpu_seconds=[0.0, 1.0])
+         train_seconds=seconds, cpu_seconds=seconds)
 """
-        return ["-c", script]
+        self.config.with_suffix(".run.py").write_text(script)
+        return ["-m", str(self.config.with_suffix(".run.py"))]
 
 
 def fake(folder: Path, behavior: str = "", steps: int = 100, seed: int = 0) -> Fake:
@@ -297,7 +297,7 @@ def test_finished_runs_are_marked_and_others_start_again(tmp_path):
     train_all([training], 1)
     assert training.is_finished and not (training.folder / "half").exists()
     assert training.history.timesteps.tolist() == [0, 100]
-    assert json.loads((training.folder / "finished.json").read_text())["command"].startswith("python -c")
+    assert json.loads((training.folder / "finished.json").read_text())["command"].startswith("python -m ")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,27 @@ def test_the_second_signal_of_a_kind_ends_the_process() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
         signal.raise_signal(signal.SIGTERM)
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="a lock that is zero bytes")
+def test_the_second_signal_ends_compiled_code_too() -> None:
+    """Python's handlers wait until the main thread leaves it, which here would be never."""
+    script = """
+import ctypes, os, signal, threading, time
+from sb3_uav.common.interruption import interruptible
+signal.signal(signal.SIGINT, signal.default_int_handler)
+def twice():
+    for _ in range(2):
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGINT)
+with interruptible():
+    threading.Thread(target=twice, daemon=True).start()
+    lock = ctypes.create_string_buffer(64)
+    for _ in range(2):
+        ctypes.CDLL(None).pthread_mutex_lock(lock)
+"""
+    assert subprocess.run([sys.executable, "-c", script], check=False, timeout=60).returncode == 130
 
 
 def test_ignored_signals_stay_ignored() -> None:

@@ -159,7 +159,8 @@ def nested(n_members: int, size: int) -> bytes:
     def header(n: int) -> bytes:
         return npy(f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({n},), }}".ljust(117))
 
-    content, entries = header(size) + bytes(size), []
+    content = header(size) + bytes(size)
+    entries: list[tuple[bytes, bytes]] = []
     for number in reversed(range(n_members)):
         name = b"%04d.npy" % number
         fields = struct.pack("<5H3I2H", 20, 0, 0, 0, 33, zlib.crc32(content), len(content), len(content), len(name), 0)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_uav.common.interruption import Interruption, without_option
+from sb3_uav.common.interruption import Interruption
 from sb3_uav.common.optional import require
 from sb3_uav.registration import DEMO_FLEET, DEMO_SIZE, allocation_id, ensure_registered
 from sb3_uav.zoo.dependencies import require_zoo
@@ -67,5 +67,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _continued(arguments: Sequence[str], changes: Sequence[str]) -> Interruption:
-    kept = without_option(arguments, ("-i", "--trained-agent")) if changes else arguments
-    return Interruption(["sb3-uav", "demo", *kept, *changes])
+    from sb3_uav.zoo.interrupted import with_changes
+
+    return Interruption(["sb3-uav", "demo", *with_changes(arguments, changes)])

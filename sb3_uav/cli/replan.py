@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_uav.cli.solve import add_flight_options, flight_of
+from sb3_uav.common.interruption import continued_by
 from sb3_uav.common.json_text import read_json_file
 from sb3_uav.common.optional import require
 from sb3_uav.missions.flight import FlightOptions
@@ -146,7 +147,8 @@ def main(argv: Sequence[str]) -> int:
 
     # Not at the cost of the time limit.
     warm_up()
-    found = replan(plan, status, args.time_limit, args.seed, args.min_gain)
+    with continued_by(["sb3-uav", "replan", *argv]):
+        found = replan(plan, status, args.time_limit, args.seed, args.min_gain)
     files = write_mission(found.plan, new_folder, flight, args.overwrite)
     _print_changes(found)
     print_plan(checked(found.plan, flight), files)

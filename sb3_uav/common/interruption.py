@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 # As shells report a command that a signal has ended.
@@ -108,10 +108,44 @@ def interruptible() -> Iterator[None]:
     if former:
         _received = None
     try:
-        yield
+        with _second_ends_compiled_code() if former else nullcontext():
+            yield
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _second_ends_compiled_code() -> Iterator[None]:
+    """
+    End the process by the second signal of a kind even while compiled code, such as an exact solver, keeps the main thread
+    busy, and Python has not answered the first one. https://docs.python.org/3/library/signal.html#signal.set_wakeup_fd
+    """
+    if sys.platform == "win32":
+        # Which takes sockets only there.
+        yield
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+
+    def watch() -> None:
+        seen: set[int] = set()
+        while received := os.read(reader, 1):
+            number = received[0]
+            if number in seen and signal.getsignal(number) is _interrupt:
+                os._exit(_SIGNAL_BASE + number)
+            seen.add(number)
+
+    thread = threading.Thread(target=watch, daemon=True, name="second signal")
+    thread.start()
+    before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(writer)
+        thread.join()
+        os.close(reader)
 
 
 def _interrupt(number: int, _frame: Any) -> None:

@@ -58,8 +58,10 @@ class EpochLines:
         """The lines of the log of its newest run, without the header."""
         from sb3_uav.common.epoch_log import LOG_FILE
 
-        logs = sorted(job.run_folder.glob(f"reinforce/*/{LOG_FILE}"), key=lambda log: log.stat().st_mtime)
-        return logs[-1].read_text(encoding="utf-8").splitlines()[1:] if logs else []
+        # By their numbers, because clocks are set and folders are copied.
+        numbered = {log.parent.name.rpartition("_")[2]: log for log in job.run_folder.glob(f"reinforce/*/{LOG_FILE}")}
+        newest = max((number for number in numbered if number.isdecimal()), key=int, default=None)
+        return [] if newest is None else numbered[newest].read_text(encoding="utf-8").splitlines()[1:]
 
     def print(self, text: str) -> None:
         """

@@ -10,6 +10,7 @@ from multiprocessing import connection
 from multiprocessing.context import SpawnProcess
 from typing import NamedTuple
 
+from sb3_uav.common.child_process import end_all, end_with_parent
 from sb3_uav.common.interruption import exit_code
 from sb3_uav.reproduce.epoch_lines import EpochLines
 from sb3_uav.reproduce.pair_training import PairTraining, TrainingError, train_pair
@@ -41,9 +42,7 @@ def train_pairs(jobs: Sequence[PairTraining], n_jobs: int) -> None:
                     assert isinstance(sentinel, int)
                     running.pop(sentinel).check()
     finally:
-        for training in running.values():
-            training.process.terminate()
-            training.process.join()
+        end_all([training.process for training in running.values()])
 
 
 class _TrainingProcess(NamedTuple):
@@ -85,10 +84,11 @@ class _TrainingProcess(NamedTuple):
 def _train_in_process(job: PairTraining, errors: connection.Connection) -> None:
     # Ctrl-C reaches all processes of a terminal; the main one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     try:
         train_pair(job)
     except KeyboardInterrupt:
-        # The main process has ended this one, and says so.
+        # The main process says so.
         raise SystemExit(exit_code()) from None
     except Exception as error:
         errors.send(str(error))

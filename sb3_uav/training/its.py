@@ -148,7 +148,8 @@ class ITSCallback(RouterCallback):
         self._statistics = EpisodeStatistics()
         self._subsets: AllocatedSubsets | None = None
         self._started = False
-        self._share = 1.0
+        # The part of the planned steps that the run takes.
+        self.share = 1.0
         self._origin: str | None = None
         self._warm_started = warm_start is None
         self._epoch_start = Moment.now()
@@ -193,7 +194,7 @@ class ITSCallback(RouterCallback):
         self._instances_before = self.epoch * self.instances_per_epoch
         self._steps_before = self.model.num_timesteps
         hand_over_router(self, self._trainer.plan)
-        n_epochs, _ = self.schedule.pretraining_of(self._share, self._trainer.epoch_size)
+        n_epochs, _ = self.schedule.pretraining_of(self.share, self._trainer.epoch_size)
         if self.epoch == 0 and len(self.records) < n_epochs:
             self._trainer.env.set_generator(WholeInstances(self.problem.generator))
             self._train_router(n_epochs, PRETRAINING, first=len(self.records))
@@ -230,7 +231,7 @@ class ITSCallback(RouterCallback):
             since = self.model.num_timesteps if self.resume_from is None else 0
             n_tasks = self.problem.generator.n_tasks
             share = share_of_plan(self.model, self.n_epochs, self.instances_per_epoch, n_tasks, since)
-        self._share = share
+        self.share = share
         self._axis.join(lambda: self.router)
         if self.warm_start is not None and not self._warm_started:
             self._start_router(self.warm_start)
@@ -250,7 +251,7 @@ class ITSCallback(RouterCallback):
 
         folder = None if self.save_path is None else self.save_path / CHECKPOINT_FOLDER / WARM_START_FOLDER
         positional = (self._trainer.policy, self.model.policy, self.problem.generator, rng)
-        offered = {"report": report, "record": record, "folder": folder, "share": self._share}
+        offered = {"report": report, "record": record, "folder": folder, "share": self.share}
         start = warm_start.bind(positional, offered)
         if folder is not None:
             bring_progress(folder, None if self.resume_from is None else self.resume_from / WARM_START_FOLDER)
@@ -370,7 +371,7 @@ class ITSCallback(RouterCallback):
         """
         size = self._trainer.epoch_size
         if phase == PRETRAINING:
-            _, size = self.schedule.pretraining_of(self._share, size)
+            _, size = self.schedule.pretraining_of(self.share, size)
         for index in range(first, n_epochs):
             start, number = Moment.now(), 1 + n_router_epochs(self.records)
             generated_before = self._generation_seconds()
@@ -432,7 +433,7 @@ class ITSCallback(RouterCallback):
         self._axis.note()
         self._save_router()
         if self.save_path is not None and distributed.is_main():
-            folder, begun = self.save_path / CHECKPOINT_FOLDER, (self._warm_started, self._share, self._origin)
+            folder, begun = self.save_path / CHECKPOINT_FOLDER, (self._warm_started, self.share, self._origin)
             write_checkpoint(folder, self.model, self.router, self.epoch, self.records, *begun, self.keep_checkpoints)
 
     def _resume(self, folder: Path) -> float | None:

@@ -21,6 +21,7 @@ from sb3_uav.common import distributed
 from sb3_uav.common.divergence import DivergenceError, note_saved, require_finite_model, with_checkpoint
 from sb3_uav.common.interruption import Interruption, continued_by, was_received
 from sb3_uav.common.random_streams import EVALUATION_SEED
+from sb3_uav.common.saving import save_atomically
 from sb3_uav.envs.vec_env import BatchedVecEnv, unwrap_problem_env
 from sb3_uav.reinforce import REINFORCE
 from sb3_uav.reinforce.finite import watch
@@ -30,6 +31,7 @@ from sb3_uav.zoo.checkpoints import PairCheckpointCallback, find_checkpoint, new
 from sb3_uav.zoo.configs import check_keys, check_values, parse_schedule, plain_numbers, read_yaml
 from sb3_uav.zoo.entries import find_entry, scaled_values
 from sb3_uav.zoo.fine_tuning import Weights, start_from, weights_to_start_from
+from sb3_uav.zoo.interrupted import Watched, open_bars, steps_of
 from sb3_uav.zoo.rl_zoo3_compat import ExperimentManager, add_algorithms, interruptible_studies, optuna, rl_zoo3
 from sb3_uav.zoo.run_folders import RunFolderGuard, make_run_folder, require_folder
 from sb3_uav.zoo.shared_study import SeedPerTrial, fail_trials_of_dead_workers, note_worker, shared_studies
@@ -154,14 +156,16 @@ class UAVExperimentManager(ExperimentManager):
         watch(model)
         if self.continue_training:
             note_saved(model, Path(self.trained_agent))
-        noted = _InterruptionNoted(model)
+        callbacks = self.callbacks
+        # Of these, rl_zoo3 calls the end even after a failure.
+        watched = Watched(model, on_failure=lambda: setattr(self, "callbacks", open_bars(callbacks)))
         try:
-            super().learn(noted)  # type: ignore[arg-type]
+            super().learn(watched)  # type: ignore[arg-type]
         except (KeyboardInterrupt, RuntimeError) as error:
             # While rl_zoo3 released what the training had used, or as a lost connection: another process has ended first.
             if isinstance(error, RuntimeError) and not was_received():
                 raise
-            noted.interruption = error
+            watched.interruption = error
         except (TypeError, OverflowError, AssertionError) as error:
             # Some values are first used in training.
             raise ValueError(f"{self._where}: training failed: {_described(error)}") from error
@@ -177,15 +181,30 @@ class UAVExperimentManager(ExperimentManager):
             if error.errno is not None or str(self.config) in str(error):
                 raise
             raise FileNotFoundError(f"{self._where}: {error}") from error
-        if noted.interruption is not None:
-            checkpoint = newest_checkpoint(Path(self.save_path))
-            raise Interruption((), () if checkpoint is None else ("-i", str(checkpoint))) from noted.interruption
+        finally:
+            self.callbacks = callbacks
+        if watched.interruption is not None:
+            raise Interruption((), self._how_to_continue(model)) from watched.interruption
+
+    def _how_to_continue(self, model: BaseAlgorithm) -> tuple[str, ...]:
+        """:return: Arguments that continue an interrupted run; without ``ITSCallback``, its state is saved for that"""
+        its = self.its
+        if its is None and model.num_timesteps > 0 and distributed.is_main():
+            save_atomically(model, Path(self.save_path) / f"rl_model_{model.num_timesteps}_steps.zip")
+            if self.normalize and (statistics := model.get_vec_normalize_env()) is not None:
+                statistics.save(f"{self.params_path}/vecnormalize.pkl")
+        checkpoint = newest_checkpoint(Path(self.save_path))
+        if checkpoint is None:
+            return ()
+        # ITS ends after its epochs, unless it was given fewer steps; SB3 counts from 0 again.
+        remaining = max(int(self.n_timesteps) - steps_of(checkpoint), 1)
+        return ("-i", str(checkpoint), *(() if its is not None and its.share == 1 else ("-n", str(remaining))))
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         require_finite_model(model, self.save_path)
         if distributed.is_main():
             require_folder(Path(self.params_path))
-            super().save_trained_model(model)
+            super().save_trained_model(Watched(model))  # type: ignore[arg-type]
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         env = super().create_envs(n_envs, eval_env, no_log or not distributed.is_main())
@@ -332,6 +351,9 @@ class UAVExperimentManager(ExperimentManager):
             raise optuna.exceptions.TrialPruned(str(error)) from error
         except _SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
+        except KeyboardInterrupt:
+            trial.study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            raise
         if not math.isfinite(mean_reward):
             raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
         return mean_reward
@@ -341,31 +363,6 @@ class UAVExperimentManager(ExperimentManager):
         """The interactive training strategy of this run, if it has one."""
         found = [callback for callback in self.callbacks if isinstance(callback, ITSCallback)]
         return found[0] if found else None
-
-
-class _InterruptionNoted:
-    """
-    An algorithm whose interruption is noted: rl_zoo3 takes Ctrl-C for the end of the training, and saves the final model.
-
-    https://github.com/DLR-RM/rl-baselines3-zoo/blob/v2.9.2/rl_zoo3/exp_manager.py#L254
-
-    :param model: The algorithm
-    """
-
-    def __init__(self, model: BaseAlgorithm) -> None:
-        self.model = model
-        self.interruption: BaseException | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.model, name)
-
-    def learn(self, *args: Any, **kwargs: Any) -> None:
-        """:raises KeyboardInterrupt: After noting it"""
-        try:
-            self.model.learn(*args, **kwargs)
-        except KeyboardInterrupt as error:
-            self.interruption = error
-            raise
 
 
 def _described(error: Exception) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 import sb3_uav  # noqa: F401  (registers the environment ids)
 from sb3_uav.common import distributed
 from sb3_uav.common.errors import main_function
-from sb3_uav.common.interruption import Interruption, without_option
+from sb3_uav.common.interruption import Interruption
 from sb3_uav.common.optional import require
 from sb3_uav.common.random_streams import draw_seed
 from sb3_uav.pretrained import names
@@ -149,8 +149,9 @@ def _continued(arguments: Sequence[str], is_kept: bool, changes: Sequence[str]) 
     if not changes:
         # From where it began.
         return Interruption([*_PROG.split(), *arguments] if is_kept else [])
-    kept = without_option(arguments, ("-i", "--trained-agent"))
-    return Interruption([*_PROG.split(), *kept, *changes], changes)
+    from sb3_uav.zoo.interrupted import with_changes
+
+    return Interruption([*_PROG.split(), *with_changes(arguments, changes)], changes)
 
 
 # For ``python -m sb3_uav.zoo.train``, with exit codes in place of exceptions.

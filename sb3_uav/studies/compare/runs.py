@@ -7,12 +7,12 @@ import os
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_uav.common.child_process import end_all, start_module
 from sb3_uav.common.files import write_atomically
 from sb3_uav.common.interruption import interruptible
 from sb3_uav.training.fixed_set_history import RESULTS_FILE, EvaluationHistory
@@ -74,14 +74,8 @@ class ZooTraining(NamedTuple):
         self.folder.mkdir(parents=True)
         environment = {**os.environ, "OMP_NUM_THREADS": str(self.n_threads)}
         with (self.folder / _LOG_FILE).open("wb") as log:
-            # In its own session, because rl_zoo3 treats Ctrl-C as a normal end of training.
-            return subprocess.Popen(
-                [sys.executable, *self.flags],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
+            # Without the -m of python.
+            return start_module(self.flags[1:], stdout=log, stderr=subprocess.STDOUT, env=environment)
 
     def finish(self, exit_code: int, seconds: float) -> str | None:
         """
@@ -132,8 +126,6 @@ def train_all(trainings: Sequence[ZooTraining], n_jobs: int) -> None:
                     failures += [] if failure is None else [failure]
                 time.sleep(0.1)
         finally:
-            for _, process, _ in running:
-                process.terminate()
-                process.wait()
+            end_all([process for _, process, _ in running])
     if failures:
         raise ValueError(f"{len(failures)} of {len(trainings)} trainings failed: {'; '.join(failures)}")
