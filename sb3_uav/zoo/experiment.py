@@ -351,9 +351,6 @@ class UAVExperimentManager(ExperimentManager):
             raise optuna.exceptions.TrialPruned(str(error)) from error
         except _SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
-        except KeyboardInterrupt:
-            trial.study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            raise
         if not math.isfinite(mean_reward):
             raise optuna.exceptions.TrialPruned(f"the mean reward is {mean_reward}")
         return mean_reward
