@@ -126,3 +126,11 @@ def test_broken_configs_are_named(tmp_path, capsys):
 def test_keys_that_are_no_text_are_named():
     with pytest.raises(ValueError, match="here: unknown key 3; known keys:"):
         check_keys({"policy", 3}, REINFORCE, "here")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("router", ["nowhere.zip", dict(zip="nowhere.zip")])
+def test_a_file_that_the_yaml_names_and_that_is_missing(tmp_path, capsys, router):
+    config = write_config(tmp_path, **its_with(router=router))
+    assert run(tmp_path, config, "--eval-freq", "-1") == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert str(config) in error and ENV in error and "nowhere.zip: no such file" in error

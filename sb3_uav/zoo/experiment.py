@@ -142,9 +142,21 @@ class UAVExperimentManager(ExperimentManager):
         finally:
             self.env_name = env_name
 
+    @contextmanager
+    def _missing_files(self) -> Iterator[None]:
+        """Name the YAML in the error about a missing file, which it names."""
+        try:
+            yield
+        except FileNotFoundError as error:
+            # The system's own errors have a number.
+            if error.errno is not None or str(self.config) in str(error):
+                raise
+            raise FileNotFoundError(f"{self._where}: {error}") from error
+
     def setup_experiment(self) -> Any:
         try:
-            return super().setup_experiment()
+            with self._missing_files():
+                return super().setup_experiment()
         except _SETUP_ERRORS as error:
             raise ValueError(f"{self._where}: {_described(error)}") from error
         except ValueError as error:
@@ -160,7 +172,8 @@ class UAVExperimentManager(ExperimentManager):
         # Of these, rl_zoo3 calls the end even after a failure.
         watched = Watched(model, on_failure=lambda: setattr(self, "callbacks", open_bars(callbacks)))
         try:
-            super().learn(watched)  # type: ignore[arg-type]
+            with self._missing_files():
+                super().learn(watched)  # type: ignore[arg-type]
         except (KeyboardInterrupt, RuntimeError) as error:
             # While rl_zoo3 released what the training had used, or as a lost connection: another process has ended first.
             if isinstance(error, RuntimeError) and not was_received():
@@ -176,11 +189,6 @@ class UAVExperimentManager(ExperimentManager):
             if str(self.config) in str(error):
                 raise
             raise ValueError(f"{self._where}: {error}") from error
-        except FileNotFoundError as error:
-            # A file that the YAML names; the system's own errors have a number.
-            if error.errno is not None or str(self.config) in str(error):
-                raise
-            raise FileNotFoundError(f"{self._where}: {error}") from error
         finally:
             self.callbacks = callbacks
         if watched.interruption is not None:
