@@ -317,7 +317,7 @@ def test_a_hostile_repository_does_nothing(here: Path, logs: Path, capsys: Any) 
     (here / "out" / "config.yml").write_text("callback: !!python/object/apply:os.system ['touch created']\n")
     load = ["load-from-hub", "--env", ENV, "--local-dir", "out"]
     assert cli.main(load) == 2
-    assert "config.yml: cannot be read as plain YAML" in capsys.readouterr().err
+    assert "config.yml: cannot be read as YAML" in capsys.readouterr().err
     assert not (here / "created").exists() and not list((here / "logs").rglob("*.zip"))
     (here / "out" / "config.yml").write_text(good)
     with zipfile.ZipFile(here / "out" / "train_eval_metrics.zip", "a") as archive:

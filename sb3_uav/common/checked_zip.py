@@ -117,7 +117,7 @@ def check_number(stream: IO[bytes]) -> None:
     """
     stream.seek(max(0, stream.seek(0, os.SEEK_END) - MAX_FILE))
     found, tail = 0, b""
-    while piece := stream.read(MIB):
+    while piece := stream.read(MIB // 16):
         found += (tail + piece).count(_SIGNATURE)
         # A signature may lie across two pieces, but none is counted twice.
         tail = piece[-(len(_SIGNATURE) - 1) :]
